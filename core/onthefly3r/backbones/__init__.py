@@ -1,0 +1,1 @@
+"""Local reconstructors behind one contract."""

@@ -1,0 +1,41 @@
+"""The contract of a local reconstructor (Phi of Eq. 1) and the registry that finds one by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from ..geometry.camera import Camera
+from ..records import LocalModel, Rejection, Subset, WorkingImage
+
+
+@dataclass(frozen=True)
+class BackboneSpec:
+    """What the engine must know of a backbone before it calls it."""
+
+    name: str
+    version: str
+    licence: str
+    confidence_threshold: float  # points below it are not used: confidences differ between models
+    has_tokens: bool = False
+
+
+class Backbone(Protocol):
+    """A frozen model that rebuilds a small subset in a frame of its own.
+
+    It sees only its subset: no map poses and no positions. `calibrations` holds the intrinsics per camera
+    key (at photograph size) that earlier subsets established; a camera key that is missing there is new, and
+    a backbone that estimates intrinsics returns them in `LocalModel.calibrations`.
+    """
+
+    @property
+    def spec(self) -> BackboneSpec:
+        """Name, licence and thresholds."""
+        ...
+
+    def reconstruct(
+        self, subset: Subset, images: Mapping[int, WorkingImage], calibrations: Mapping[str, Camera]
+    ) -> LocalModel | Rejection:
+        """Rebuild the subset; images that could not be placed are missing from the model's views."""
+        ...

@@ -1,0 +1,65 @@
+"""What can go wrong and who can mend it.
+
+    OnTheFly3RError              anything this package raises on purpose
+    ├── InputError               the caller's input is wrong: says what, where and how to mend it (exit 2)
+    │   ├── OptionError          an option's name or value
+    │   ├── PhotographError      one photograph cannot be used (reported, never fatal for the others)
+    │   ├── ReferenceFormatError a reference model, trajectory, cloud or position file
+    │   └── MissingDependencyError the interpreter lacks a package or a system library
+    ├── ReconstructionError      nothing could be reconstructed (exit 3, the report is still written)
+    │   └── GeoreferenceError    the map cannot be tied to the Earth (exit 3, the report is still written)
+    └── Cancelled                the caller asked to stop (exit 130)
+
+A local model that does not fit the map is no exception: see `records.Rejection`.
+"""
+
+from __future__ import annotations
+
+
+class OnTheFly3RError(Exception):
+    """Anything this package raises on purpose."""
+
+    exit_code = 1
+
+
+class InputError(OnTheFly3RError):
+    """The caller's input is wrong; the message says what, where and how to mend it."""
+
+    exit_code = 2
+
+
+class OptionError(InputError):
+    """An option's name or value is wrong."""
+
+
+class PhotographError(InputError):
+    """One photograph cannot be used; the run goes on without it."""
+
+    def __init__(self, image: str, reason: str) -> None:
+        super().__init__(f"{image}: {reason}")
+        self.image = image
+        self.reason = reason
+
+
+class ReferenceFormatError(InputError):
+    """A reference model, trajectory, cloud or position file cannot be read."""
+
+
+class MissingDependencyError(InputError):
+    """The interpreter lacks a package or a system library that the request needs."""
+
+
+class ReconstructionError(OnTheFly3RError):
+    """Nothing could be reconstructed from the photographs."""
+
+    exit_code = 3
+
+
+class GeoreferenceError(ReconstructionError):
+    """The map cannot be tied to the Earth with the positions at hand."""
+
+
+class Cancelled(OnTheFly3RError):
+    """The caller asked to stop."""
+
+    exit_code = 130

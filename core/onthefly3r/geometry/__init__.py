@@ -1,0 +1,1 @@
+"""Transforms, cameras and frames: plain numpy, no other layer below."""

@@ -1,0 +1,1 @@
+"""From files to shots and working images."""

@@ -1,0 +1,1 @@
+"""The map: state, store, pose graph, georeferencing, fusion."""

@@ -1,0 +1,238 @@
+"""What the stages hand to each other: frozen records, array fields with shape, frame and unit.
+
+    GpsFix, Attitude -> Shot -> WorkingImage -> Features -> Descriptor
+    -> Subset -> LocalModel -> Correspondences -> Alignment | Rejection -> Submap, Edge -> GeoReference
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from .geometry.arrays import Float, UInt8
+from .geometry.camera import Camera, PixelMap
+from .geometry.transforms import Rigid3, Sim3
+
+VerticalReference = Literal["ellipsoidal", "egm96", "egm2008", "relative", "unknown"]
+
+
+@dataclass(frozen=True)
+class GpsFix:
+    """A position from the tags; sigma is None where the tags do not state it."""
+
+    lat_deg: float  # WGS 84
+    lon_deg: float
+    height_m: float | None  # in `vertical`
+    vertical: VerticalReference = "unknown"
+    sigma_h_m: float | None = None
+    sigma_v_m: float | None = None
+    rtk: int | None = None  # DJI RtkFlag: 0 none, 16 single, 32-49 float, 50 fixed
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """Gimbal angles: yaw from true north clockwise, pitch -90 at nadir, roll about the viewing axis."""
+
+    yaw_deg: float
+    pitch_deg: float
+    roll_deg: float
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One photograph before its pixels are used; sizes are those of the decoded, upright image."""
+
+    name: str  # path relative to the given folder, posix style: unique
+    path: Path
+    width_px: int
+    height_px: int
+    camera_key: str  # maker, model, lens, size: shots with the same key share intrinsics
+    focal_ratio: float  # prior focal length / longest side
+    focal_ratio_sigma: float  # relative standard deviation of that prior (0.05 = 5 %)
+    focal_source: str  # "exif+sensor", "exif 35 mm", "guess", "option"
+    time_s: float | None = None  # capture time, seconds since 1970 in the camera's own clock
+    orientation: int = 1  # EXIF orientation of the file; the decoded image is upright
+    gps: GpsFix | None = None
+    attitude: Attitude | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class WorkingImage:
+    """A shot's pixels at working size, upright RGB."""
+
+    shot: Shot
+    rgb: UInt8  # (H, W, 3)
+    working_from_photo: PixelMap
+
+    @property
+    def prior_camera(self) -> Camera:
+        """The camera that the tags suggest, at working size, without distortion."""
+        height, width = self.rgb.shape[:2]
+        focal = self.shot.focal_ratio * max(self.shot.width_px, self.shot.height_px)
+        photo = Camera(
+            self.shot.width_px, self.shot.height_px, focal, focal, self.shot.width_px / 2, self.shot.height_px / 2
+        )
+        return photo.through(self.working_from_photo, width, height)
+
+
+@dataclass(frozen=True)
+class Features:
+    """Local features of one working image."""
+
+    pixels: Float  # (N, 2) float32, working image
+    scales: Float  # (N,) float32 px
+    angles: Float  # (N,) float32 rad
+    descriptors: UInt8  # (N, 128) RootSIFT
+
+
+@dataclass(frozen=True)
+class Neighbour:
+    """A retrieved frame and its cosine similarity."""
+
+    index: int
+    similarity: float
+
+
+@dataclass(frozen=True)
+class Subset:
+    """What one backbone call sees (Eq. 8): references that are in the map, and new images; indices of shots."""
+
+    references: tuple[int, ...]
+    new: tuple[int, ...]
+
+    @property
+    def members(self) -> tuple[int, ...]:
+        """References first, then new images."""
+        return self.references + self.new
+
+
+@dataclass(frozen=True)
+class LocalView:
+    """One image of a local model; the point map may be smaller than the working image."""
+
+    camera: Camera  # intrinsics at the size of the point map
+    grid_from_photo: PixelMap  # from the upright photograph to the point map's pixels
+    local_from_cam: Rigid3
+    points: Float  # (H, W, 3) float32, local frame; NaN where nothing is known
+    confidence: Float  # (H, W) float32 in 0..1; 0 where points are NaN
+    tokens: Float | None = None  # (D,) context token of a neural backbone
+
+
+@dataclass(frozen=True)
+class LocalModel:
+    """Phi(f(subset)) (Eq. 1, Eq. 9): views by shot index in one arbitrary local frame; failed images are missing."""
+
+    views: Mapping[int, LocalView]
+    metric: bool = False  # local units are metres
+    calibrations: Mapping[str, Camera] = field(default_factory=dict)  # per camera key, photograph size
+    notes: Mapping[str, float] = field(default_factory=dict)  # figures for the report
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """Pairs of local and map points of the references (Eq. 10)."""
+
+    local: Float  # (N, 3) local frame
+    map: Float  # (N, 3) map frame
+    weight: Float  # (N,)
+    reference: Float  # (N,) shot index of the reference each pair comes from
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The Sim(3) of a subset to the map (Eq. 11) and how well it is known."""
+
+    map_from_local: Sim3
+    covariance: Float  # (7, 7) of [rotation rad, translation map units, log scale], left perturbation at the centroid
+    centroid: Float  # (3,) map frame: where the perturbation is anchored
+    inlier_ratio: float
+    residual: float  # robust standard deviation of the residuals, map units
+    n_points: int
+    references: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """A local model that did not fit: an ordinary outcome, with numbers."""
+
+    images: tuple[int, ...]
+    stage: str  # intake, retrieval, seed, backbone, alignment, references, queries
+    reason: str
+    numbers: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class CompactReference:
+    """H_i (Eq. 2): a few confident points of one accepted frame, spread over the image."""
+
+    pixels: Float  # (P, 2) int32 column, row in the point map
+    points: Float  # (P, 3) float32, frame of the submap that predicted them
+    confidence: Float  # (P,) float32
+
+
+@dataclass(frozen=True)
+class Frame:
+    """F_i (Eq. 3): an accepted image; its pose lives in the frame of the submap that predicted it."""
+
+    index: int
+    submap: int
+    camera: Camera
+    grid_from_photo: PixelMap
+    submap_from_cam: Rigid3
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A measured Sim(3) between two submaps."""
+
+    source: int  # submap
+    target: int  # submap
+    source_from_target: Sim3
+    covariance: Float  # (7, 7) [rotation, translation, log scale] right perturbation in the target frame
+    inlier_ratio: float
+
+
+@dataclass(frozen=True)
+class GeoReference:
+    """The map tied to the Earth: local ENU about an origin, and the CRS of the export."""
+
+    enu_from_map: Sim3
+    origin_lat_deg: float
+    origin_lon_deg: float
+    origin_height_m: float
+    crs: str  # e.g. EPSG:32633
+    vertical: VerticalReference
+    method: str
+    n_used: int
+    n_outliers: int
+    rmse_h_m: float
+    rmse_v_m: float
+    residuals_m: Mapping[int, tuple[float, float, float]] = field(default_factory=dict)  # shot -> east, north, up
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class PlacedCamera:
+    """A camera in the export frame (projected CRS, or metres of the map when local)."""
+
+    index: int
+    name: str
+    camera: Camera  # at the size of the photograph
+    world_from_cam: Rigid3
+    batch: int
+    retries: int = 0
+
+
+@dataclass(frozen=True)
+class CloudTile:
+    """A piece of the fused cloud in the export frame."""
+
+    points: Float  # (N, 3) float64, export CRS, m
+    rgb: UInt8  # (N, 3)
+    confidence: Float  # (N,) float32 0..1
+    source: Float  # (N,) int32 shot index of the strongest observation
+    batch: Float  # (N,) int32
+    views: Float  # (N,) int32 number of images that saw the voxel

@@ -1,0 +1,1 @@
+"""Alignment, validation and pruning of local models."""

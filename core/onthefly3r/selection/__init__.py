@@ -1,0 +1,1 @@
+"""Descriptors, retrieval and dynamic subsets."""

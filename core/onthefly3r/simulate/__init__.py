@@ -1,0 +1,1 @@
+"""Synthetic surveys with truth, and the oracle backbone."""
