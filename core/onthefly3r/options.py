@@ -43,9 +43,7 @@ class IntakeOptions:
     """Which photographs are read, and how."""
 
     recursive: bool = option(True, "look for photographs in sub-folders too")
-    min_side_px: int = option(
-        200, "photographs with a shorter side are refused", unit="px", minimum=16, advanced=True
-    )
+    min_side_px: int = option(200, "photographs with a shorter side are refused", unit="px", minimum=16, advanced=True)
     focal_35mm: float | None = option(
         None, "35-mm equivalent focal length; replaces what the EXIF tags say", unit="mm", minimum=1.0, advanced=True
     )
@@ -66,12 +64,18 @@ class SelectionOptions:
         2, "references an image must share with the batch it joins (tau_o)", unit="images", minimum=0, advanced=True
     )
     min_similarity: float = option(
-        0.0, "similarity to the batch that an image must reach to join it (tau_s)", minimum=-1.0, maximum=1.0,
+        0.0,
+        "similarity to the batch that an image must reach to join it (tau_s)",
+        minimum=-1.0,
+        maximum=1.0,
         advanced=True,
     )
     lookahead: int = option(
-        40, "waiting images among which a batch may be filled; 1 keeps the strict arrival order", unit="images",
-        minimum=1, advanced=True,
+        40,
+        "waiting images among which a batch may be filled; 1 keeps the strict arrival order",
+        unit="images",
+        minimum=1,
+        advanced=True,
     )
     gps_candidates: bool = option(
         True, "let GPS positions propose reference candidates (they never decide)", advanced=True
@@ -87,9 +91,7 @@ class BackboneOptions:
         1000, "longest side to which photographs are reduced for reconstruction", unit="px", minimum=200, maximum=8000
     )
     features: int = option(4000, "most local features per image", unit="features", minimum=200, advanced=True)
-    dense_px: int = option(
-        500, "longest side of the dense point maps", unit="px", minimum=64, maximum=8000
-    )
+    dense_px: int = option(500, "longest side of the dense point maps", unit="px", minimum=64, maximum=8000)
     threads: int = option(0, "processor cores to use; 0 takes all", unit="cores", minimum=0)
 
 
@@ -119,8 +121,10 @@ class PoseGraphOptions:
     """Drift removal (paper Sec. III-F)."""
 
     pose_graph: Literal["sim3", "se3", "none"] = option(
-        "sim3", "sim3 moves submaps with their points, se3 is the paper's frame graph, none switches it off",
-        choices=("sim3", "se3", "none"), advanced=True,
+        "sim3",
+        "sim3 moves submaps with their points, se3 is the paper's frame graph, none switches it off",
+        choices=("sim3", "se3", "none"),
+        advanced=True,
     )
 
 
@@ -130,7 +134,8 @@ class GeoreferenceOptions:
 
     crs: str | None = option(None, "projected target CRS, e.g. EPSG:32633; default: UTM zone of the median position")
     vertical: Literal["auto", "ellipsoidal", "egm96", "egm2008"] = option(
-        "auto", "what the photographs' heights refer to; auto decides from the tags and says so",
+        "auto",
+        "what the photographs' heights refer to; auto decides from the tags and says so",
         choices=("auto", "ellipsoidal", "egm96", "egm2008"),
     )
     local: bool = option(False, "write map units without a CRS when positions are missing or not asked for")
@@ -144,7 +149,9 @@ class ExportOptions:
 
     format: Literal["laz", "las"] = option("laz", "point cloud format", choices=("laz", "las"))
     spacing_m: float | None = option(
-        None, "voxel size of the fused cloud; default: the ground sampling distance of the point maps", unit="m",
+        None,
+        "voxel size of the fused cloud; default: the ground sampling distance of the point maps",
+        unit="m",
         minimum=0.0001,
     )
     min_confidence: float = option(0.5, "least confidence of an exported point", minimum=0.0, maximum=1.0)

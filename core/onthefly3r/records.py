@@ -1,7 +1,7 @@
 """What the stages hand to each other: frozen records, array fields with shape, frame and unit.
 
-    GpsFix, Attitude -> Shot -> WorkingImage -> Features -> Descriptor
-    -> Subset -> LocalModel -> Correspondences -> Alignment | Rejection -> Submap, Edge -> GeoReference
+GpsFix, Attitude -> Shot -> WorkingImage -> Features -> Descriptor
+-> Subset -> LocalModel -> Correspondences -> Alignment | Rejection -> Submap, Edge -> GeoReference
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ def rotation_exp(rotation_vector: Float) -> Float:
     k = skew(np.asarray(rotation_vector, float))
     if angle < 1e-8:
         return np.asarray(np.eye(3) + k + 0.5 * k @ k)
-    return np.asarray(np.eye(3) + np.sin(angle) / angle * k + (1.0 - np.cos(angle)) / angle**2 * k @ k
+    return np.asarray(np.eye(3) + np.sin(angle) / angle * k + (1.0 - np.cos(angle)) / angle**2 * k @ k)
 
 
 def rotation_log(rotation: Float) -> Float:
