@@ -1,0 +1,308 @@
+"""Set up On-the-Fly3R in an environment of its own beside this file, and run it there.
+
+    python3 bootstrap.py setup                        make .venv and install the package
+    python3 bootstrap.py demo [OUT]                   render a small survey and reconstruct it
+    python3 bootstrap.py run PHOTOS OUT [options...]  reconstruct a folder of photographs
+    python3 bootstrap.py test [pytest arguments...]   lint, types and tests
+
+Standard library only, Linux, macOS and Windows, no administrator rights. Other programs may import this
+module and call `create_environment`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import hashlib
+import importlib.util
+import json
+import os
+import platform
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent
+STAMP_NAME = "onthefly3r-stamp.json"
+OLDEST_PYTHON = (3, 10)
+TEST_EXTRAS = ("cloud", "neural", "test")
+
+# Room that an installation needs while it is under way, in MiB: wheels, their unpacked files and pip's copies.
+BASE_NEED_MIB = 1200
+EXTRA_NEED_MIB = {"neural": 6000, "cloud": 1200, "test": 200}
+
+# The tests need only a processor: 2.13.0 is the release whose processor-only build they are run with, which
+# saves the gigabytes of GPU libraries where the index offers that build.
+TEST_CONSTRAINTS = "torch==2.13.0\n"
+
+Report = Callable[[str], None]
+
+
+class SetupError(Exception):
+    """The environment cannot be made; the message says how to mend it."""
+
+
+def say(message: str) -> None:
+    """Print a line at once, whatever the console's encoding."""
+    encoding = sys.stdout.encoding or "utf-8"
+    print(message.encode(encoding, "replace").decode(encoding), flush=True)
+
+
+def environment_python(folder: Path) -> Path:
+    """Return the interpreter of the environment in `folder`."""
+    return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def clean_environ() -> dict[str, str]:
+    """Return this process's variables without those that lead another interpreter astray."""
+    led_astray = ("PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP", "__PYVENV_LAUNCHER__", "VIRTUAL_ENV")
+    environ = {name: value for name, value in os.environ.items() if name not in led_astray}
+    environ.update(PYTHONUTF8="1", PYTHONNOUSERSITE="1", PIP_DISABLE_PIP_VERSION_CHECK="1")
+    return environ
+
+
+def create_environment(
+    folder: Path,
+    extras: Iterable[str] = (),
+    progress: Report = say,
+    *,
+    source: Path = ROOT,
+    constraints: str = "",
+) -> Path:
+    """Make the environment in `folder`, install the package of `source` with `extras`, return its interpreter.
+
+    Returns at once when a stamp in the folder says that this was done already; extras add up. `constraints` are
+    lines of a pip constraints file. Raises `SetupError` with the remedy.
+    """
+    folder = Path(folder).absolute()
+    python = environment_python(folder)
+    wanted = set(extras)
+    installed = _read_stamp(folder)
+    stamp = {
+        "interpreter": f"{platform.python_version()} {platform.machine()} {folder}",
+        "package": _package_hash(source),
+    }
+    if installed.get("interpreter") == stamp["interpreter"] and python.exists():
+        if installed.get("package") == stamp["package"] and wanted <= set(installed["extras"]):
+            return python
+        wanted |= set(installed["extras"])
+    else:
+        _make_venv(folder, progress)
+    _check_room(folder, wanted)
+    (folder / STAMP_NAME).unlink(missing_ok=True)
+    named = f"[{','.join(sorted(wanted))}]" if wanted else ""
+    progress(f"Installing onthefly3r{named} into {folder}; the first time takes some minutes.")
+    _pip_install(python, f"{source}{named}", constraints, progress)
+    (folder / STAMP_NAME).write_text(json.dumps({**stamp, "extras": sorted(wanted)}, indent=1), encoding="utf-8")
+    return python
+
+
+def has_nvidia_gpu() -> bool:
+    """Return whether nvidia-smi is there, works, and lists a GPU."""
+    tool = shutil.which("nvidia-smi")
+    if tool is None:
+        return False
+    try:
+        listing = subprocess.run(
+            [tool, "-L"], capture_output=True, text=True, timeout=60, check=False, stdin=subprocess.DEVNULL
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return listing.returncode == 0 and "GPU" in listing.stdout
+
+
+def _read_stamp(folder: Path) -> dict[str, Any]:
+    try:
+        stamp = json.loads((folder / STAMP_NAME).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return stamp if isinstance(stamp, dict) and isinstance(stamp.get("extras"), list) else {}
+
+
+def _package_hash(source: Path) -> str:
+    """Return a hash of the requirements and of the place that an editable installation points to."""
+    return hashlib.sha256((source / "pyproject.toml").read_bytes() + str(source).encode()).hexdigest()
+
+
+def _make_venv(folder: Path, progress: Report) -> None:
+    if importlib.util.find_spec("venv") is None or importlib.util.find_spec("ensurepip") is None:
+        version = f"{sys.version_info.major}.{sys.version_info.minor}"
+        raise SetupError(
+            f"This Python ({sys.executable}) lacks the venv or ensurepip module.\n"
+            f"On Debian and Ubuntu install it with: sudo apt-get install python3-venv\n"
+            f"(or python{version}-venv), then run this command again."
+        )
+    progress(f"Making the environment {folder}")
+    made = subprocess.run(
+        [sys.executable, "-m", "venv", "--clear", str(folder)],
+        capture_output=True,
+        text=True,
+        errors="replace",
+        check=False,
+        env=clean_environ(),
+        stdin=subprocess.DEVNULL,
+    )
+    if made.returncode != 0:
+        told = (made.stdout + made.stderr).strip()
+        remedy = " (on Debian and Ubuntu: sudo apt-get install python3-venv)" if "ensurepip" in told else ""
+        raise SetupError(f"The environment {folder} could not be made{remedy}:\n{told}")
+
+
+def _check_room(folder: Path, extras: Iterable[str]) -> None:
+    """Refuse to start what the disk cannot hold; torch with GPU libraries is counted only where there is a GPU."""
+    need = BASE_NEED_MIB + sum(EXTRA_NEED_MIB.get(extra, 0) for extra in extras)
+    free = shutil.disk_usage(folder).free // 2**20
+    if free < need:
+        raise SetupError(f"{folder} has {free} MiB free, and the installation needs about {need} MiB: make room.")
+
+
+def _pip_install(python: Path, requirement: str, constraints: str, progress: Report) -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        command = [str(python), "-m", "pip", "install", "--progress-bar", "off", "--no-input", "-e", requirement]
+        if constraints:
+            constraint_file = Path(scratch) / "constraints.txt"
+            constraint_file.write_text(constraints, encoding="utf-8")
+            command += ["-c", str(constraint_file)]
+        process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            text=True,
+            encoding="utf-8",
+            errors="replace",
+            env=clean_environ(),
+        )
+        told: list[str] = []
+        assert process.stdout is not None
+        with process.stdout:
+            for line in process.stdout:
+                told.append(line.rstrip())
+                if line.startswith(("Collecting", "Installing")) or line.lstrip().startswith("Downloading"):
+                    progress(f"  {line.strip()[:110]}")
+        if process.wait() != 0:
+            raise SetupError(explain_pip_failure("\n".join(told[-60:])))
+
+
+def explain_pip_failure(told: str) -> str:
+    """Return what pip's output means and how to mend it."""
+    unreachable = ("NewConnectionError", "ConnectTimeoutError", "name resolution", "ProxyError", "getaddrinfo")
+    if any(sign in told for sign in unreachable):
+        meaning = (
+            "The package index cannot be reached. Connect this machine to the network, or tell pip a proxy "
+            "(variable HTTPS_PROXY) or a folder of wheels (variable PIP_FIND_LINKS), and run the command again."
+        )
+    elif "No space left" in told:
+        meaning = "The disk is full. Make room (several GiB) and run the command again."
+    elif "No matching distribution" in told:
+        meaning = (
+            "A package has no build for this interpreter and system. Use 64-bit Python "
+            f"{OLDEST_PYTHON[0]}.{OLDEST_PYTHON[1]} to 3.13; pip's words follow."
+        )
+    else:
+        meaning = "pip could not install the package; its words follow."
+    return f"{meaning}\n{told.strip()}"
+
+
+def _call(command: Sequence[str | Path], **variables: str) -> int:
+    """Run a command to its end and return its exit status; Ctrl-C is left to the command to handle."""
+    environ = {**clean_environ(), **variables}
+    with subprocess.Popen([str(part) for part in command], env=environ) as process:
+        while True:
+            with contextlib.suppress(KeyboardInterrupt):
+                return process.wait()
+
+
+def missing_system_libraries(python: Path) -> list[str]:
+    """Return one sentence for each package of the environment that a system library is missing for."""
+    told = subprocess.run(
+        [str(python), "-m", "onthefly3r", "doctor", "--json"],
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        check=False,
+        env=clean_environ(),
+        stdin=subprocess.DEVNULL,
+    ).stdout
+    try:
+        checks = json.loads(told)["checks"]
+    except (ValueError, KeyError, TypeError):
+        return []
+    return [f"{check['name']}: {check['remedy']}" for check in checks if check.get("missing_libraries")]
+
+
+def setup(environment: Path) -> int:
+    """Make the environment, with torch where an NVIDIA GPU is found."""
+    extras = ("neural",) if has_nvidia_gpu() else ()
+    python = create_environment(environment, extras)
+    say(f"Ready. Interpreter: {python}")
+    return 0
+
+
+def demo(environment: Path, out: Path, rest: Sequence[str]) -> int:
+    """Render a small survey, reconstruct it and compare with the truth."""
+    return _call([create_environment(environment), "-m", "onthefly3r", "demo", out, *rest])
+
+
+def run(environment: Path, rest: Sequence[str]) -> int:
+    """Hand everything to the command line's `run`."""
+    return _call([create_environment(environment), "-m", "onthefly3r", "run", *rest])
+
+
+def test(environment: Path, rest: Sequence[str]) -> int:
+    """Run every check to its end, and return 0 only when all passed."""
+    python = create_environment(environment, TEST_EXTRAS, constraints=TEST_CONSTRAINTS)
+    for sentence in missing_system_libraries(python):
+        say(f"Tests that need it will be skipped: {sentence}")
+    checks: dict[str, list[str | Path]] = {
+        "ruff check": [python, "-m", "ruff", "check", ROOT],
+        "ruff format": [python, "-m", "ruff", "format", "--check", ROOT],
+        "mypy": [python, "-m", "mypy", "--config-file", ROOT / "pyproject.toml"],
+        "pytest": [python, "-m", "pytest", "--rootdir", ROOT, "-c", ROOT / "pyproject.toml", *rest],
+    }
+    outcome = {}
+    for name, command in checks.items():
+        say(f"== {name}")
+        outcome[name] = _call(command)
+    failed = [name for name, status in outcome.items() if status != 0]
+    say(f"Failed: {', '.join(failed)}" if failed else "All checks passed: " + ", ".join(checks))
+    return 1 if failed else 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one verb and return the exit status: the verb's own, 2 when the environment cannot be made."""
+    parser = argparse.ArgumentParser(
+        prog="bootstrap.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("verb", choices=("setup", "demo", "run", "test"))
+    parser.add_argument("rest", nargs=argparse.REMAINDER, help="what the verb takes")
+    chosen = parser.parse_args(arguments)
+    if sys.version_info < OLDEST_PYTHON:
+        say(f"Python {OLDEST_PYTHON[0]}.{OLDEST_PYTHON[1]} or newer is needed; this is {platform.python_version()}.")
+        return 2
+    environment = ROOT / ".venv"
+    try:
+        if chosen.verb == "setup":
+            return setup(environment)
+        if chosen.verb == "demo":
+            named = bool(chosen.rest) and not chosen.rest[0].startswith("-")
+            out = Path(chosen.rest.pop(0)) if named else Path("demo-survey")
+            return demo(environment, out, chosen.rest)
+        if chosen.verb == "run":
+            return run(environment, chosen.rest)
+        return test(environment, chosen.rest)
+    except SetupError as error:
+        say(str(error))
+        return 2
+    except KeyboardInterrupt:
+        say("Stopped.")
+        return 128 + signal.SIGINT
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
