@@ -51,3 +51,9 @@ def omega_phi_kappa_deg(world_from_cam: Float) -> tuple[float, float, float]:
     phi = np.degrees(np.arcsin(np.clip(r[0, 2], -1.0, 1.0)))
     kappa = np.degrees(np.arctan2(-r[0, 1], r[0, 0]))
     return float(omega), float(phi), float(kappa)
+
+
+def world_from_cam_rotation(omega_deg: float, phi_deg: float, kappa_deg: float) -> Float:
+    """Return the (3, 3) rotation world <- OpenCV camera, the inverse of `omega_phi_kappa_deg`."""
+    r = _axis_rotation(0, omega_deg) @ _axis_rotation(1, phi_deg) @ _axis_rotation(2, kappa_deg)
+    return np.asarray(r @ PHOTOGRAMMETRIC_FROM_OPENCV.T)
