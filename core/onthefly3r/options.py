@@ -93,6 +93,15 @@ class BackboneOptions:
     features: int = option(4000, "most local features per image", unit="features", minimum=200, advanced=True)
     dense_px: int = option(500, "longest side of the dense point maps", unit="px", minimum=64, maximum=8000)
     threads: int = option(0, "processor cores to use; 0 takes all", unit="cores", minimum=0)
+    weights: str | None = option(
+        None, "weights of a neural backbone: a file, a folder, or a hub id with its revision (owner/name@revision)"
+    )
+    device: Literal["auto", "cuda", "mps", "cpu"] = option(
+        "auto", "where neural networks run; auto takes the GPU where there is one", choices=("auto", "cuda", "mps", "cpu")
+    )
+    max_gpu_memory_gib: float | None = option(
+        None, "most GPU memory a neural backbone may take; default: all of it", unit="GiB", minimum=0.5, advanced=True
+    )
 
 
 @dataclass(frozen=True)
