@@ -60,6 +60,15 @@ class Shot:
 
 
 @dataclass(frozen=True)
+class RefusedPhotograph:
+    """A file that never became a shot: named, because it has no index."""
+
+    name: str  # path relative to the given folder, posix style
+    reason: str
+    numbers: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class WorkingImage:
     """A shot's pixels at working size, upright RGB."""
 
