@@ -1,1 +1,1 @@
-"""From files to shots and working images."""
+"""From a folder of photographs to shots (header pass) and working images (pixels)."""

@@ -1,0 +1,85 @@
+"""A folder of photographs to shots in capture order; whatever cannot be used is named with its reason."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import random
+from collections import defaultdict
+from pathlib import Path
+
+from ..errors import InputError, PhotographError
+from ..options import IntakeOptions
+from ..records import RefusedPhotograph, Shot
+from .metadata import read_shot
+from .opening import SUFFIXES
+
+
+def read_photographs(folder: Path, options: IntakeOptions) -> tuple[list[Shot], list[RefusedPhotograph]]:
+    """Return the shots of a folder by capture time then name, and the files that were refused.
+
+    Shots without a capture time come last. `options.limit` cuts in capture order, before any shuffling.
+    Raises `InputError` when the folder is missing or holds no photograph by its suffixes.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give the folder that holds the photographs")
+    paths = find_photographs(folder, options.recursive)
+    if not paths:
+        where = "it or its sub-folders" if options.recursive else "it (sub-folders are not searched)"
+        raise InputError(f"{folder}: no JPEG, PNG or TIFF file in {where}")
+    refused = _duplicates(folder, paths)
+    shots: list[Shot] = []
+    for path in paths:
+        name = path.relative_to(folder).as_posix()
+        if name in refused:
+            continue
+        try:
+            shots.append(read_shot(path, name, options))
+        except PhotographError as error:
+            refused[name] = RefusedPhotograph(name, error.reason)
+        except OSError as error:
+            refused[name] = RefusedPhotograph(name, f"cannot be read ({error.strerror or type(error).__name__})")
+    shots.sort(key=lambda shot: (math.inf if shot.time_s is None else shot.time_s, shot.name))
+    shots = shots[: options.limit]
+    if options.shuffle_seed is not None:
+        random.Random(options.shuffle_seed).shuffle(shots)  # noqa: S311 (an order for tests, no secret)
+    return shots, [refused[name] for name in sorted(refused)]
+
+
+def find_photographs(folder: Path, recursive: bool) -> list[Path]:
+    """Return the files with a photograph's suffix, sorted by name; hidden files and folders are left out."""
+    found: list[Path] = []
+    for parent, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith(".")) if recursive else []
+        found += [
+            Path(parent, name)
+            for name in names
+            if not name.startswith(".") and os.path.splitext(name)[1].lower() in SUFFIXES  # noqa: PTH122
+        ]
+    return sorted(found, key=lambda path: path.relative_to(folder).as_posix())
+
+
+def _duplicates(folder: Path, paths: list[Path]) -> dict[str, RefusedPhotograph]:
+    """Return the files whose bytes repeat an earlier one's; only files of equal size are read."""
+    by_size: dict[int, list[Path]] = defaultdict(list)
+    for path in paths:
+        try:
+            by_size[path.stat().st_size].append(path)
+        except OSError:
+            continue  # a vanished file or dangling link is refused when it is opened
+    refused: dict[str, RefusedPhotograph] = {}
+    for same_size in by_size.values():
+        if len(same_size) < 2:
+            continue
+        first: dict[str, str] = {}
+        for path in same_size:
+            name = path.relative_to(folder).as_posix()
+            try:
+                digest = hashlib.blake2b(path.read_bytes()).hexdigest()
+            except OSError:
+                continue
+            kept = first.setdefault(digest, name)
+            if kept != name:
+                refused[name] = RefusedPhotograph(name, f"the same file as {kept}")
+    return refused
