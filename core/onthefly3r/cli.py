@@ -1,0 +1,148 @@
+"""The command line: run, export, evaluate, simulate, demo, doctor, view.
+
+Exit codes: 0 done, 2 the input is wrong, 3 nothing reconstructed or georeferenced, 130 cancelled, 1 unexpected.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from . import __version__
+from .command_options import run_options, with_run_options
+from .console import session, use_utf8
+from .errors import InputError
+
+if TYPE_CHECKING:
+    from .engine import Result
+
+app = typer.Typer(
+    help="Georeferenced point clouds from drone photographs while they arrive.",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+
+JsonLines = Annotated[
+    bool, typer.Option("--json", help="print one JSON object per line instead of a progress bar", show_default=False)
+]
+Out = Annotated[Path, typer.Argument(metavar="OUT", help="output folder; it is made")]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(__version__)
+        raise typer.Exit()
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", help="print the version", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+@with_run_options()
+def run(
+    photos: Annotated[Path, typer.Argument(metavar="PHOTOS", help="folder of photographs")],
+    out: Out,
+    json: JsonLines = False,
+    **values: Any,
+) -> None:
+    """Reconstruct a folder of photographs: cloud, cameras and report in OUT."""
+    with session(json_lines=json, crash_folder=out) as here:
+        options = run_options(values)
+        _require_folder(photos, "PHOTOS")
+        from .engine import reconstruct
+
+        result = reconstruct(photos, out, options, here.progress, here.cancelled)
+        here.reporter.result(_result_data(result), _result_summary(result))
+
+
+@app.command()
+@with_run_options("georeference", "export")
+def export(
+    result: Annotated[Path, typer.Argument(metavar="RESULT", help="output folder of an earlier run")],
+    out: Out,
+    json: JsonLines = False,
+    **values: Any,
+) -> None:
+    """Write the files of an earlier run again, with another CRS, format or spacing, into OUT."""
+    with session(json_lines=json, crash_folder=out) as here:
+        options = run_options(values)
+        _require_folder(result, "RESULT")
+        from .engine import export_again
+
+        again = export_again(result, out, options, here.progress)
+        here.reporter.result(_result_data(again), _result_summary(again))
+
+
+@app.command()
+def doctor(
+    json: Annotated[bool, typer.Option("--json", help="print one JSON object", show_default=False)] = False,
+) -> None:
+    """Check the interpreter, its packages and the machine, and say how to mend what is missing."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from .doctor import examine, is_fit, to_json
+
+    checks = examine(Path.cwd())
+    if json:
+        print(to_json(checks))
+    else:
+        table = Table("", "check", "found", "to mend it", box=None)
+        for check in checks:
+            colour = {"ok": "green", "note": "yellow", "missing": "red"}[check.status]
+            table.add_row(Text(check.status, colour), check.name, Text(check.found), Text(check.remedy))
+        Console(highlight=False).print(table)
+    raise typer.Exit(0 if is_fit(checks) else InputError.exit_code)
+
+
+def main() -> None:
+    """Run the command line; the entry point of the console script."""
+    use_utf8()
+    app(prog_name="onthefly3r")
+
+
+def _require_folder(path: Path, name: str) -> None:
+    if not path.is_dir():
+        found = "is a file" if path.exists() else "does not exist"
+        raise InputError(f"{name} {path} {found}: name a folder")
+
+
+def _result_data(result: Result) -> dict[str, Any]:
+    """Return the data of a result event: paths and the counts; the figures are in the report."""
+    paths = {"cloud": result.cloud, "cameras": result.cameras, "report": result.report_path}
+    return {
+        **{name: None if path is None else str(path) for name, path in paths.items()},
+        "placed": result.placed,
+        "given": result.given,
+    }
+
+
+def _result_summary(result: Result) -> dict[str, str]:
+    """Return what a person wants to know first, by name."""
+    report = result.report
+    summary = {"placed": f"{result.placed} of {result.given} photographs"}
+    georeference, cloud, timing = report.get("georeference"), report.get("cloud"), report.get("timing")
+    if georeference:
+        summary["CRS"] = f"{georeference['crs']}, heights {georeference['vertical']}"
+        if georeference.get("rmse_h_m") is not None:
+            rmse = f"{georeference['rmse_h_m']:.2f} m horizontally, {georeference['rmse_v_m']:.2f} m vertically"
+            summary["positions"] = f"{georeference['n_used']} used, residuals {rmse} (RMS, not the accuracy)"
+    if cloud:
+        summary["points"] = f"{cloud['points']:,}, {cloud['mean_spacing_m']:.3f} m apart"
+    if timing:
+        summary["time"] = f"{timing['total_s']:.0f} s, {timing['per_image_s']:.2f} s per photograph"
+    for name, path in (("cloud", result.cloud), ("cameras", result.cameras), ("report", result.report_path)):
+        if path is not None:
+            summary[name] = str(path)
+    return summary

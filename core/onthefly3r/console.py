@@ -1,0 +1,244 @@
+"""How a command speaks to whoever started it: a progress bar or JSON lines, exit codes, Ctrl-C, crash notes."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import signal
+import sys
+import tempfile
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, TextIO
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from . import protocol
+from .errors import Cancelled, MissingDependencyError, OnTheFly3RError
+
+# Failures of the disk or of permissions: the user can mend them, a traceback would not help.
+_DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG)
+
+
+class HumanReporter:
+    """A progress bar on standard error and the result as a table on standard output."""
+
+    def __init__(self) -> None:
+        self.errors = Console(stderr=True, highlight=False)
+        self._stage = ""
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TaskProgressColumn(),
+            TextColumn("{task.fields[counts]}"),
+            TextColumn("{task.fields[left]}"),
+            TimeElapsedColumn(),
+            console=self.errors,
+        )
+        self._task = self._bar.add_task("starting", total=None, counts="", left="")
+
+    def __enter__(self) -> HumanReporter:
+        """Show the bar where there is a terminal to show it on."""
+        if self.errors.is_terminal:
+            self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Take the bar away."""
+        self._bar.stop()
+
+    def progress(self, report: protocol.Progress) -> None:
+        """Show how far the run is; without a terminal, one line per stage."""
+        counts = f"{report.placed} placed, {report.rejected} rejected, {report.waiting} waiting"
+        left = "" if report.eta_s is None else f"{_clock(report.eta_s)} left"
+        self._bar.update(
+            self._task,
+            description=report.stage,
+            completed=report.done,
+            total=report.total or None,
+            counts=counts if report.placed or report.rejected or report.waiting else report.message,
+            left=left,
+        )
+        if not self.errors.is_terminal and report.stage != self._stage:
+            print(report.stage, file=sys.stderr, flush=True)
+        self._stage = report.stage
+
+    def warning(self, message: str) -> None:
+        """Print a warning above the bar."""
+        self.errors.print(f"warning: {message}", style="yellow", markup=False, soft_wrap=True)
+
+    def error(self, message: str, exit_code: int) -> None:
+        """Print why the command ends."""
+        colour = "yellow" if exit_code == Cancelled.exit_code else "red"
+        self.errors.print(message, style=colour, markup=False, soft_wrap=True)
+
+    def result(self, data: dict[str, Any], summary: dict[str, str]) -> None:
+        """Print the summary as a table of two columns."""
+        self._bar.stop()
+        table = Table.grid(padding=(0, 2))
+        for name, value in summary.items():
+            table.add_row(name, value)
+        # A path must stay whole when the output goes to a file or a pipe.
+        Console(highlight=False, markup=False, soft_wrap=True).print(table)
+
+
+class JsonReporter:
+    """One JSON object per line on standard output, and nothing else there."""
+
+    def __init__(self) -> None:
+        self._lines: TextIO = sys.stdout
+        self._kept = contextlib.ExitStack()
+
+    def __enter__(self) -> JsonReporter:
+        """Keep standard output for the events: what libraries print goes to standard error."""
+        if sys.stdout is sys.__stdout__:
+            self._lines.flush()
+            kept = os.dup(1)
+            self._lines = self._kept.enter_context(open(kept, "w", encoding="utf-8", newline="\n"))  # noqa: PTH123 - a descriptor
+            self._kept.callback(os.dup2, kept, 1)
+            os.dup2(2, 1)
+        self._kept.enter_context(contextlib.redirect_stdout(sys.stderr))
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Give standard output back."""
+        self._kept.close()
+
+    def _emit(self, event: protocol.Event) -> None:
+        self._lines.write(event.to_line() + "\n")
+        self._lines.flush()
+
+    def progress(self, report: protocol.Progress) -> None:
+        """Write a progress event."""
+        self._emit(protocol.Event.progress(report))
+
+    def warning(self, message: str) -> None:
+        """Write a warning event."""
+        self._emit(protocol.Event("warning", {"message": message}))
+
+    def error(self, message: str, exit_code: int) -> None:
+        """Write the event that says why the command ends."""
+        self._emit(protocol.Event("error", {"message": message, "exit_code": exit_code}))
+
+    def result(self, data: dict[str, Any], summary: dict[str, str]) -> None:
+        """Write the result event."""
+        self._emit(protocol.Event("result", data))
+
+
+class Session:
+    """What a command works with: where it reports, and whether it was asked to stop."""
+
+    def __init__(self, reporter: HumanReporter | JsonReporter) -> None:
+        self.reporter = reporter
+        self.stop_asked = False
+
+    def cancelled(self) -> bool:
+        """Return whether Ctrl-C or a termination signal arrived."""
+        return self.stop_asked
+
+    def progress(self, report: protocol.Progress) -> None:
+        """Pass a report on; raises `Cancelled` when the user asked to stop."""
+        if self.stop_asked:
+            raise Cancelled("stopped on request")
+        self.reporter.progress(report)
+
+
+@contextlib.contextmanager
+def session(*, json_lines: bool, crash_folder: Path | None = None, polite: bool = True) -> Iterator[Session]:
+    """Run a command's body: errors become one sentence and an exit code, never a traceback.
+
+    With `polite`, the first Ctrl-C or termination signal asks the work to stop at its next report and the second
+    ends it; without, the first ends it. Unexpected errors leave a traceback in `crash_folder`.
+    """
+    with JsonReporter() if json_lines else HumanReporter() as reporter:
+        here = Session(reporter)
+        with _signals(here, polite), _warnings_to(reporter):
+            try:
+                yield here
+                return
+            except OnTheFly3RError as error:
+                message, exit_code = str(error), error.exit_code
+            except (KeyboardInterrupt, BrokenPipeError):
+                message, exit_code = "stopped on request", Cancelled.exit_code
+            except MemoryError:
+                message, exit_code = "not enough memory: lower --working-px or --dense-px, or close other programs", 1
+            except ImportError as error:
+                message = f"{error}: the command 'onthefly3r doctor' says what is missing and how to install it"
+                exit_code = MissingDependencyError.exit_code
+            except Exception as error:
+                if isinstance(error, OSError) and error.errno in _DISK_TROUBLE:
+                    message, exit_code = f"{error.strerror}: {error.filename or crash_folder}", 2
+                else:
+                    message = (
+                        f"unexpected {type(error).__name__}: {error}; the traceback is in {_note_crash(crash_folder)}"
+                    )
+                    exit_code = 1
+        with contextlib.suppress(BrokenPipeError):
+            reporter.error(message, exit_code)
+    raise typer.Exit(exit_code)
+
+
+@contextlib.contextmanager
+def _signals(here: Session, polite: bool) -> Iterator[None]:
+    def stop(number: int, frame: FrameType | None) -> None:
+        if here.stop_asked or not polite:
+            raise KeyboardInterrupt
+        here.stop_asked = True
+
+    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name)]
+    before = {number: signal.signal(number, stop) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _warnings_to(reporter: HumanReporter | JsonReporter) -> Iterator[None]:
+    """Pass what the package logs as a warning to the user."""
+
+    class Handler(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            reporter.warning(record.getMessage())
+
+    logger = logging.getLogger("onthefly3r")
+    handler = Handler(logging.WARNING)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+def _note_crash(folder: Path | None) -> Path:
+    """Save the traceback in `folder`/work, or in the temporary folder where that cannot be written."""
+    text = traceback.format_exc()
+    for place in (folder / "work" if folder else None, Path(tempfile.gettempdir())):
+        with contextlib.suppress(OSError):
+            if place is not None:
+                place.mkdir(parents=True, exist_ok=True)
+                note = place / "crash.txt"
+                note.write_text(text, encoding="utf-8")
+                return note
+    sys.stderr.write(text)
+    return Path("standard error")
+
+
+def use_utf8() -> None:
+    """Let both streams carry any file name, on Windows consoles too."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(encoding="utf-8", errors="replace")
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d}"
