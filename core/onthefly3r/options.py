@@ -97,7 +97,9 @@ class BackboneOptions:
         None, "weights of a neural backbone: a file, a folder, or a hub id with its revision (owner/name@revision)"
     )
     device: Literal["auto", "cuda", "mps", "cpu"] = option(
-        "auto", "where neural networks run; auto takes the GPU where there is one", choices=("auto", "cuda", "mps", "cpu")
+        "auto",
+        "where neural networks run; auto takes the GPU where there is one",
+        choices=("auto", "cuda", "mps", "cpu"),
     )
     max_gpu_memory_gib: float | None = option(
         None, "most GPU memory a neural backbone may take; default: all of it", unit="GiB", minimum=0.5, advanced=True
