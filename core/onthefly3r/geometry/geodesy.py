@@ -73,7 +73,8 @@ class EnuFrame:
     def to_geographic(self, enu: Float) -> Float:
         """Map ENU (..., 3) to latitude, longitude (deg) and ellipsoidal height (m)."""
         geocentric = np.asarray(enu, float) @ self._rotation() + self._origin()
-        lat, lon, height = _geocentric_from_geographic().transform(*np.moveaxis(geocentric, -1, 0), direction="INVERSE")
+        x, y, z = np.moveaxis(geocentric, -1, 0)
+        lat, lon, height = _geocentric_from_geographic().transform(x, y, z, direction="INVERSE")
         return np.stack([lat, lon, height], axis=-1)
 
     def _rotation(self) -> Float:
@@ -163,8 +164,7 @@ def transformation_accuracy_m(crs: str, lat_deg: float, lon_deg: float) -> float
 
     Raises `OptionError` when PROJ has no transformation but a ballpark one.
     """
-    from pyproj.aoi import AreaOfInterest
-    from pyproj.transformer import TransformerGroup
+    from pyproj.transformer import AreaOfInterest, TransformerGroup
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # "best transformation is not available": the accuracy says it
