@@ -1,0 +1,111 @@
+"""Photographs of a simulated survey: JPEG files with the EXIF and XMP tags of a drone."""
+
+from __future__ import annotations
+
+import io
+import math
+import time
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from ..geometry.arrays import UInt8
+from ..records import GpsFix
+from .flight import Survey, TrueView
+from .scene import Scene
+
+SUPERSAMPLING = 1.5  # samples per pixel side: smooths the outlines of houses
+SENSOR_NOISE = 1.5  # standard deviation in grey levels
+FOCAL_35MM = 24
+FOCAL_MM = 8.8
+MAKER, MODEL = "OnTheFly3R", "Simulator"
+EXIF_IFD, GPS_IFD = 0x8769, 0x8825
+
+
+def render(scene: Scene, view: TrueView, supersampling: float = SUPERSAMPLING) -> UInt8:
+    """Return the photograph (H, W, 3) RGB of a view, the same for the same arguments."""
+    import cv2
+
+    fine = view.camera.resized(round(view.camera.width * supersampling), round(view.camera.height * supersampling))
+    rays = fine.rays(fine.pixel_centres()).reshape(-1, 3)
+    hits = scene.cast(view.enu_from_cam.translation, rays @ view.enu_from_cam.rotation.T)
+    distance_m = float(np.nanmedian(hits.distances)) if (hits.faces >= 0).any() else 1.0
+    image = scene.colour(hits, footprint_m=distance_m / fine.fx).reshape(fine.height, fine.width, 3)
+    image = cv2.resize(image, (view.camera.width, view.camera.height), interpolation=cv2.INTER_AREA)
+    rng = np.random.default_rng(zlib.crc32(view.name.encode()))
+    noise = SENSOR_NOISE * rng.standard_normal(image.shape, dtype=np.float32)
+    return np.asarray(np.clip(image + noise + 0.5, 0, 255), np.uint8)
+
+
+def write_photograph(path: Path, rgb: UInt8, view: TrueView, ground_height_m: float) -> None:
+    """Write a JPEG with tags; `ground_height_m`: ellipsoidal height that relative altitudes count from."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(rgb).save(
+        buffer, "JPEG", quality=92, exif=_exif(view), xmp=_xmp(view, ground_height_m).encode("utf-8")
+    )
+    part = path.with_name(path.name + ".part")
+    part.write_bytes(buffer.getvalue())
+    part.replace(path)
+
+
+def photograph_survey_view(survey: Survey, view: TrueView, folder: Path) -> None:
+    """Render one view of a survey into a folder."""
+    write_photograph(folder / view.name, render(survey.scene, view), view, survey.origin.height_m)
+
+
+def _exif(view: TrueView) -> bytes:
+    from PIL import Image
+
+    stamp = time.strftime("%Y:%m:%d %H:%M:%S", time.gmtime(view.time_s))
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110], exif[0x0112], exif[0x0132] = MAKER, MODEL, 1, stamp
+    details = exif.get_ifd(EXIF_IFD)
+    details[0x9003] = details[0x9004] = stamp  # DateTimeOriginal, DateTimeDigitized
+    details[0x920A], details[0xA405] = FOCAL_MM, FOCAL_35MM
+    details[0xA002], details[0xA003] = view.camera.width, view.camera.height
+    fix, gps = view.gps, exif.get_ifd(GPS_IFD)
+    gps[0] = b"\x02\x03\x00\x00"
+    gps[1], gps[2] = "N" if fix.lat_deg >= 0 else "S", _degrees_minutes_seconds(fix.lat_deg)
+    gps[3], gps[4] = "E" if fix.lon_deg >= 0 else "W", _degrees_minutes_seconds(fix.lon_deg)
+    if fix.height_m is not None:
+        gps[5], gps[6] = bytes([int(fix.height_m < 0)]), round(abs(fix.height_m), 3)
+    return exif.tobytes()
+
+
+def _degrees_minutes_seconds(angle_deg: float) -> tuple[float, float, float]:
+    minutes, degrees = math.modf(abs(angle_deg))
+    seconds, minutes = math.modf(minutes * 60.0)
+    return degrees, minutes, round(seconds * 60.0, 7)
+
+
+def _xmp(view: TrueView, ground_height_m: float) -> str:
+    """Return the packet in the vocabulary that DJI drones write."""
+    fix: GpsFix = view.gps
+    height_m = fix.height_m or 0.0
+    tags = {
+        "AltitudeType": "RtkAlt",  # ellipsoidal
+        "GpsLatitude": f"{fix.lat_deg:+.9f}",
+        "GpsLongitude": f"{fix.lon_deg:+.9f}",
+        "AbsoluteAltitude": f"{height_m:+.3f}",
+        "RelativeAltitude": f"{height_m - ground_height_m:+.3f}",
+        "GimbalRollDegree": f"{view.attitude.roll_deg:+.2f}",
+        "GimbalYawDegree": f"{view.attitude.yaw_deg:+.2f}",
+        "GimbalPitchDegree": f"{view.attitude.pitch_deg:+.2f}",
+    }
+    if fix.rtk is not None:
+        tags |= {
+            "RtkFlag": str(fix.rtk),
+            "RtkStdLon": f"{fix.sigma_h_m:.5f}",
+            "RtkStdLat": f"{fix.sigma_h_m:.5f}",
+            "RtkStdHgt": f"{fix.sigma_v_m:.5f}",
+        }
+    attributes = "\n".join(f'   drone-dji:{name}="{value}"' for name, value in tags.items())
+    return (
+        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n<x:xmpmeta xmlns:x="adobe:ns:meta/">\n'
+        ' <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">\n  <rdf:Description rdf:about=""\n'
+        f'   xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/"\n{attributes}/>\n'
+        ' </rdf:RDF>\n</x:xmpmeta>\n<?xpacket end="w"?>'
+    )
