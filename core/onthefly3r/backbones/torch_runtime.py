@@ -1,0 +1,278 @@
+"""One runtime for all neural backbones: device, precision, weights, GPU memory; the only place that drives torch.
+
+A neural backbone is a subclass of `TorchBackbone` that says how photographs are prepared, how the network is
+built and what its output means (see docs/backbones.md). Nothing here imports torch before it is used.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import logging
+import sys
+import time
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ..errors import MissingDependencyError, OptionError
+from ..geometry.arrays import Float
+from ..geometry.camera import Camera
+from ..options import BackboneOptions
+from ..records import LocalModel, Rejection, Subset, WorkingImage
+from .base import BackboneSpec
+from .conventions import Canvas, NetworkImage, Prediction, compose, local_views, median_calibrations
+from .weights import FILE_NAMES, Weights, find_weights, load_strict, read_state
+
+log = logging.getLogger("onthefly3r.backbones")
+GIB = float(1 << 30)
+
+
+@dataclass(frozen=True)
+class ModelCard:
+    """What a user must know of a neural backbone before it runs."""
+
+    name: str
+    title: str
+    module: str  # the upstream package that must be importable
+    install: str  # the command that installs it
+    code_licence: str
+    weights_licence: str
+    weights_source: str  # a sentence: where the weights are
+    confidence_threshold: float
+    memory_gib: float | None = None  # GPU memory for a subset of 10 as published; None: not published
+    weights_files: tuple[str, ...] = FILE_NAMES
+    needs: tuple[str, ...] = ()  # further packages that the upstream code imports
+
+    @property
+    def licence(self) -> str:
+        """Licences of code and weights in one line."""
+        return f"code {self.code_licence}; weights {self.weights_licence}"
+
+    def missing_packages(self) -> list[str]:
+        """Return the packages among torch, the upstream code and its needs that are not installed."""
+        return [name for name in ("torch", self.module, *self.needs) if importlib.util.find_spec(name) is None]
+
+    def install_sentence(self) -> str:
+        """Return how to install what is missing."""
+        return f"pip install torch, then: {self.install}"
+
+
+class TorchBackbone(ABC):
+    """A frozen 3R network behind the backbone contract; subclasses only convert.
+
+    Raises `MissingDependencyError` or `OptionError` when it is made without code or weights. The network is
+    built and loaded when the first subset comes.
+    """
+
+    card: ClassVar[ModelCard]
+    spare_weights: ClassVar[tuple[str, ...]] = ()  # prefixes of weights that this use of the model leaves over
+
+    def __init__(self, options: BackboneOptions) -> None:
+        missing = self.card.missing_packages()
+        if missing:
+            raise MissingDependencyError(
+                f"backbone {self.card.name}: {', '.join(missing)} is not installed: {self.card.install_sentence()}"
+            )
+        self._weights = find_weights(self.card.name, options.weights, self.card.weights_source, self.card.weights_files)
+        self._options = options
+        self._network: Any = None
+        self._most_images: int | None = None  # what fitted into GPU memory after it had run out
+
+    @abstractmethod
+    def prepare(self, image: WorkingImage) -> NetworkImage:
+        """Resize and crop one photograph as the network wants it."""
+
+    @abstractmethod
+    def build(self, state: Mapping[str, Any], config: Mapping[str, Any]) -> tuple[Any, Mapping[str, Any]]:
+        """Import the upstream code; return the network, still without weights, and the state under its own keys."""
+
+    @abstractmethod
+    def predict(self, network: Any, images: Any) -> Prediction:
+        """Run the network on images (1, S, 3, H, W) in 0..1 on its device and convert what it answers."""
+
+    @property
+    def spec(self) -> BackboneSpec:
+        """Name, licence and thresholds."""
+        return BackboneSpec(
+            name=self.card.name,
+            version=self._weights.label,
+            licence=self.card.licence,
+            confidence_threshold=self.card.confidence_threshold,
+            has_tokens=True,
+        )
+
+    def reconstruct(
+        self, subset: Subset, images: Mapping[int, WorkingImage], calibrations: Mapping[str, Camera]
+    ) -> LocalModel | Rejection:
+        """Rebuild the subset; when GPU memory runs out, half of the new images are left out and it goes on."""
+        started_s = time.perf_counter()
+        network = self._loaded()
+        least = 1 if subset.references else 2
+        new = subset.new
+        if self._most_images is not None:
+            new = new[: max(least, self._most_images - len(subset.references))]
+        while True:
+            members = subset.references + new
+            canvas = compose([self.prepare(images[index]) for index in members])
+            prediction = self._run(network, canvas)
+            if prediction is not None:
+                break
+            if len(new) <= least:
+                return Rejection(
+                    subset.members,
+                    "backbone",
+                    "out of memory: not even one new image fits; give --max-gpu-memory-gib more, or --device cpu",
+                    {"images": float(len(members)), "height_px": canvas.size[0], "width_px": canvas.size[1]},
+                )
+            new = new[: max(least, len(new) // 2)]
+            self._most_images = len(subset.references) + len(new)
+            log.warning("%s: GPU memory ran out; going on with %d images", self.card.name, self._most_images)
+        views = local_views(members, canvas, prediction)
+        notes = {
+            "inference_s": time.perf_counter() - started_s,
+            "left_out_for_memory": float(len(subset.new) - len(new)),
+            **gpu_memory(self._device),
+        }
+        return LocalModel(views, prediction.metric, median_calibrations(views, images, calibrations), notes)
+
+    def _loaded(self) -> Any:
+        if self._network is None:
+            log.info("%s: licence: %s", self.card.name, self.card.licence)
+            self._device = select_device(self._options.device)
+            limit_gpu_memory(self._device, self._options.max_gpu_memory_gib)
+            if self._device.type == "cpu" and self._options.threads:
+                import torch
+
+                torch.set_num_threads(self._options.threads)
+            self._network = self._load(self._weights)
+        return self._network
+
+    def _load(self, weights: Weights) -> Any:
+        with _quiet_upstream():
+            network, state = self.build(read_state(weights.path), weights.config)
+        load_strict(network, state, str(weights.path), self.spare_weights)
+        network = network.eval().requires_grad_(False)
+        try:
+            return network.to(self._device)
+        except RuntimeError as error:
+            if not is_out_of_memory(error):
+                raise
+            raise OptionError(
+                f"backbone {self.card.name}: the network alone does not fit into the memory of {self._device}; "
+                "give --max-gpu-memory-gib more, or --device cpu"
+            ) from error
+
+    def _run(self, network: Any, canvas: Canvas) -> Prediction | None:
+        import torch
+
+        dtype = autocast_dtype(self._device)
+        try:
+            images = torch.from_numpy(np.ascontiguousarray(np.moveaxis(canvas.rgb, 3, 1)))[None].to(self._device)
+            autocast = torch.autocast(self._device.type, dtype, enabled=dtype is not None)
+            with torch.inference_mode(), autocast, _quiet_upstream():
+                return self.predict(network, images)
+        except RuntimeError as error:
+            if not is_out_of_memory(error):
+                raise
+        release_memory(self._device)
+        return None
+
+
+def select_device(name: str) -> Any:
+    """Return the torch device of `auto`, `cuda`, `mps` or `cpu`; raises `OptionError` for one that is not there."""
+    import torch
+
+    available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    if name == "auto":
+        return torch.device(next(kind for kind, there in available.items() if there))
+    if not available[name]:
+        raise OptionError(f"device: {name} is not available to torch {torch.__version__} here; choose auto or cpu")
+    return torch.device(name)
+
+
+def autocast_dtype(device: Any) -> Any:
+    """Return the reduced precision of a device: bf16 from compute capability 8, else fp16; None keeps fp32."""
+    import torch
+
+    if device.type != "cuda":
+        return None
+    return torch.bfloat16 if torch.cuda.get_device_capability(device)[0] >= 8 else torch.float16
+
+
+def limit_gpu_memory(device: Any, limit_gib: float | None) -> None:
+    """Cap what torch may take of the GPU's memory."""
+    import torch
+
+    if limit_gib is not None and device.type == "cuda":
+        total = torch.cuda.get_device_properties(device).total_memory
+        torch.cuda.set_per_process_memory_fraction(min(1.0, limit_gib * GIB / total), device)
+
+
+def gpu_memory(device: Any) -> dict[str, float]:
+    """Return the peak GPU memory since the last call in GiB, nothing on other devices."""
+    import torch
+
+    if device.type != "cuda":
+        return {}
+    peak = torch.cuda.max_memory_allocated(device) / GIB
+    torch.cuda.reset_peak_memory_stats(device)
+    return {"gpu_peak_gib": peak}
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Say whether an error means that a device's memory ran out."""
+    import torch
+
+    text = str(error).lower()
+    return isinstance(error, torch.OutOfMemoryError) or any(
+        phrase in text for phrase in ("out of memory", "not enough memory", "can't allocate memory")
+    )
+
+
+def release_memory(device: Any) -> None:
+    """Give cached GPU memory back after it ran out."""
+    import gc
+
+    import torch
+
+    gc.collect()
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
+    elif device.type == "mps":
+        torch.mps.empty_cache()
+
+
+def to_numpy(tensor: Any) -> Float:
+    """Return a tensor as a float32 array on the host."""
+    return np.asarray(tensor.detach().float().cpu().numpy())
+
+
+def imagenet_normalised(images: Any, mean: Sequence[float], std: Sequence[float]) -> Any:
+    """Return images (..., 3, H, W) in 0..1 with mean and standard deviation per channel taken out."""
+    shape = (3, 1, 1)
+    return (images - images.new_tensor(mean).view(shape)) / images.new_tensor(std).view(shape)
+
+
+@contextmanager
+def captured(module: Any, pick: Callable[[Any], Any]) -> Iterator[list[Any]]:
+    """Collect `pick(output)` of every call of a sub-module, for tokens that a network does not return."""
+    kept: list[Any] = []
+    handle = module.register_forward_hook(lambda _module, _inputs, output: kept.append(pick(output)))
+    try:
+        yield kept
+    finally:
+        handle.remove()
+
+
+@contextmanager
+def _quiet_upstream() -> Iterator[None]:
+    """Keep upstream prints out of standard output, which carries events, and its warnings from the user."""
+    with contextlib.redirect_stdout(sys.stderr), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
