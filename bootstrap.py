@@ -191,7 +191,15 @@ def _pip_install(python: Path, requirement: str, constraints: str, progress: Rep
 
 def explain_pip_failure(told: str) -> str:
     """Return what pip's output means and how to mend it."""
-    unreachable = ("NewConnectionError", "ConnectTimeoutError", "name resolution", "ProxyError", "getaddrinfo")
+    # setuptools is asked for first, and runs everywhere: an index that has none of it was not reached.
+    unreachable = (
+        "satisfies the requirement setuptools",
+        "NewConnectionError",
+        "ConnectTimeoutError",
+        "name resolution",
+        "ProxyError",
+        "getaddrinfo",
+    )
     if any(sign in told for sign in unreachable):
         meaning = (
             "The package index cannot be reached. Connect this machine to the network, or tell pip a proxy "
@@ -201,18 +209,17 @@ def explain_pip_failure(told: str) -> str:
         meaning = "The disk is full. Make room (several GiB) and run the command again."
     elif "No matching distribution" in told:
         meaning = (
-            "A package has no build for this interpreter and system. Use 64-bit Python "
-            f"{OLDEST_PYTHON[0]}.{OLDEST_PYTHON[1]} to 3.13; pip's words follow."
+            "A package has no build for this interpreter and system: "
+            "use a 64-bit Python 3.10 to 3.14; pip's words follow."
         )
     else:
         meaning = "pip could not install the package; its words follow."
     return f"{meaning}\n{told.strip()}"
 
 
-def _call(command: Sequence[str | Path], **variables: str) -> int:
+def _call(command: Sequence[str | Path]) -> int:
     """Run a command to its end and return its exit status; Ctrl-C is left to the command to handle."""
-    environ = {**clean_environ(), **variables}
-    with subprocess.Popen([str(part) for part in command], env=environ) as process:
+    with subprocess.Popen([str(part) for part in command], env=clean_environ()) as process:
         while True:
             with contextlib.suppress(KeyboardInterrupt):
                 return process.wait()

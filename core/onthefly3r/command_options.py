@@ -42,10 +42,8 @@ def option_parameters(options_class: type, panel: str) -> list[inspect.Parameter
     for item in dataclasses.fields(options_class):
         if "help" not in item.metadata:
             continue
-        if item.metadata["advanced"]:
-            place = SWITCHES_PANEL if hints[item.name] is bool else ADVANCED_PANEL
-        else:
-            place = panel
+        advanced_panel = SWITCHES_PANEL if hints[item.name] is bool else ADVANCED_PANEL
+        place = advanced_panel if item.metadata["advanced"] else panel
         parameters.append(_parameter(item.name, hints[item.name], describe(item), item.metadata["unit"], place))
     return parameters
 

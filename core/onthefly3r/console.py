@@ -18,7 +18,6 @@ from typing import Any, TextIO
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from . import protocol
 from .errors import Cancelled, MissingDependencyError, OnTheFly3RError
@@ -80,13 +79,11 @@ class HumanReporter:
         self.errors.print(message, style=colour, markup=False, soft_wrap=True)
 
     def result(self, data: dict[str, Any], summary: dict[str, str]) -> None:
-        """Print the summary as a table of two columns."""
+        """Print the summary in two columns; a path is never broken."""
         self._bar.stop()
-        table = Table.grid(padding=(0, 2))
+        width = max(map(len, summary), default=0)
         for name, value in summary.items():
-            table.add_row(name, value)
-        # A path must stay whole when the output goes to a file or a pipe.
-        Console(highlight=False, markup=False, soft_wrap=True).print(table)
+            print(f"{name:<{width}}  {value}")
 
 
 class JsonReporter:

@@ -1,0 +1,23 @@
+"""Fixtures that several test files share."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def photograph_sets() -> Path:
+    """Folder of real photograph sets: photos/, reference/ and perhaps gcp_list.txt in a sub-folder for each set."""
+    named = os.environ.get("ONTHEFLY3R_PHOTOGRAPHS")
+    folder = Path(named) if named else ROOT.parent / "shared" / "data"
+    if not any(folder.glob("*/photos")):
+        pytest.skip(
+            f"no real photographs in {folder}: name a folder of sets (SET/photos, SET/reference) "
+            "in the variable ONTHEFLY3R_PHOTOGRAPHS"
+        )
+    return folder

@@ -1,0 +1,36 @@
+"""Events survive the way through a line of text."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from onthefly3r.protocol import Event, Progress
+
+values = st.one_of(st.none(), st.booleans(), st.integers(-(2**53), 2**53), st.text())
+names = st.text(min_size=1).filter(lambda name: name not in ("kind", "time_s"))
+
+
+@given(st.sampled_from(["progress", "warning", "result", "error"]), st.dictionaries(names, values))
+def test_event_line_and_back(kind: str, data: dict[str, object]) -> None:
+    event = Event(kind, data, time_s=1700000000.125)
+    line = event.to_line()
+    assert not {"\n", "\r"} & set(line)
+    assert Event.from_line(line) == event
+
+
+def test_progress_event_carries_every_count() -> None:
+    report = Progress("mapping", 3, 9, placed=2, rejected=1, waiting=6, eta_s=4.5, message="batch 1")
+    told = json.loads(Event.progress(report).to_line())
+    assert told["kind"] == "progress"
+    assert (told["stage"], told["done"], told["total"]) == ("mapping", 3, 9)
+    assert (told["placed"], told["rejected"], told["waiting"], told["eta_s"]) == (2, 1, 6, 4.5)
+
+
+@pytest.mark.parametrize("line", ["", "{}", "[1]", '{"kind": 3}', "reading photograph 3", '{"kind": "a"'])
+def test_other_lines_are_refused(line: str) -> None:
+    with pytest.raises(ValueError):
+        Event.from_line(line)
