@@ -25,7 +25,7 @@ FOUNDATION = {"errors", "options", "protocol", "geometry"}
 COMMAND_LINE = {"cli", "command_options", "console"}
 LAYERS = (
     FOUNDATION,
-    {"records"},
+    {"records", "networks"},
     {"intake", "selection", "backbones", "registration", "evaluate"},
     {"mapping"},
     {"export", "simulate"},

@@ -16,8 +16,6 @@ from ..geometry.camera import Camera, PixelMap
 from ..geometry.transforms import Rigid3, nearest_rotation
 from ..records import LocalView, WorkingImage
 
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
 MIN_FOV_RAD, MAX_FOV_RAD = 0.02, 3.1  # outside of these a predicted field of view is no camera
 
 

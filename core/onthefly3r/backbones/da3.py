@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import OptionError
+from ..networks.torch_tools import captured, imagenet_normalised, to_numpy
+from ..networks.weights import without_prefix
 from ..records import WorkingImage
 from .conventions import (
-    IMAGENET_MEAN,
-    IMAGENET_STD,
     NetworkImage,
     Prediction,
     confidence_from_one_plus_exp,
@@ -19,8 +19,7 @@ from .conventions import (
     rigid_inverse,
     unproject,
 )
-from .torch_runtime import ModelCard, TorchBackbone, captured, imagenet_normalised, to_numpy
-from .weights import without_prefix
+from .torch_runtime import ModelCard, TorchBackbone
 
 # The any-view models by the width of their transformer; METRIC and MONO see single images only.
 MODELS = {384: "da3-small", 768: "da3-base", 1024: "da3-large", 1536: "da3-giant"}
@@ -71,7 +70,7 @@ class DepthAnything3(TorchBackbone):
     def predict(self, network: Any, images: Any) -> Prediction:
         """Run it; the token of an image is its camera token (there are no registers)."""
         with captured(network.backbone, lambda output: output[0][-1][1][0]) as tokens:
-            answer = network(imagenet_normalised(images, IMAGENET_MEAN, IMAGENET_STD))
+            answer = network(imagenet_normalised(images))
         matrices = to_numpy(answer["intrinsics"][0])
         intrinsics = np.stack([matrices[:, 0, 0], matrices[:, 1, 1], matrices[:, 0, 2], matrices[:, 1, 2]], axis=1)
         return Prediction(

@@ -9,17 +9,16 @@ from typing import Any
 import numpy as np
 
 from ..errors import MissingDependencyError, OptionError
+from ..networks.torch_tools import captured, imagenet_normalised, to_numpy
 from ..records import WorkingImage
 from .conventions import (
-    IMAGENET_MEAN,
-    IMAGENET_STD,
     NetworkImage,
     Prediction,
     centred_box,
     confidence_from_one_plus_exp,
     network_image,
 )
-from .torch_runtime import ModelCard, TorchBackbone, captured, imagenet_normalised, to_numpy
+from .torch_runtime import ModelCard, TorchBackbone
 
 # Sizes (width, height) the model was trained at, by the aspect that chooses them.
 SIZES = {
@@ -78,7 +77,7 @@ class MapAnything(TorchBackbone):
 
     def predict(self, network: Any, images: Any) -> Prediction:
         """Run it; the token of an image is its additional token of the information sharing transformer."""
-        normalised = imagenet_normalised(images[0], IMAGENET_MEAN, IMAGENET_STD)
+        normalised = imagenet_normalised(images[0])
         views = [{"img": image[None], "data_norm_type": ["dinov2"]} for image in normalised]
         with captured(network.info_sharing, _tokens) as tokens:
             answer = network.infer(views, use_amp=images.device.type == "cuda", apply_mask=True)

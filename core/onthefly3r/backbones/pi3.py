@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ..networks.torch_tools import captured, to_numpy
 from ..records import WorkingImage
 from .conventions import NetworkImage, Prediction, confidence_from_logit, network_image
-from .torch_runtime import ModelCard, TorchBackbone, captured, to_numpy
+from .torch_runtime import ModelCard, TorchBackbone
 
 MAX_AREA_PX = 255_000
 PATCH_PX = 14

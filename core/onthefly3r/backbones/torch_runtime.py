@@ -6,31 +6,34 @@ built and what its output means (see docs/backbones.md). Nothing here imports to
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
 import logging
-import sys
 import time
-import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ..errors import MissingDependencyError, OptionError
-from ..geometry.arrays import Float
 from ..geometry.camera import Camera
+from ..networks.torch_tools import (
+    autocast_dtype,
+    gpu_memory,
+    is_out_of_memory,
+    limit_gpu_memory,
+    quiet_upstream,
+    release_memory,
+    select_device,
+)
+from ..networks.weights import FILE_NAMES, Weights, find_weights, load_strict, read_state
 from ..options import BackboneOptions
 from ..records import LocalModel, Rejection, Subset, WorkingImage
 from .base import BackboneSpec
 from .conventions import Canvas, NetworkImage, Prediction, compose, local_views, median_calibrations
-from .weights import FILE_NAMES, Weights, find_weights, load_strict, read_state
 
 log = logging.getLogger("onthefly3r.backbones")
-GIB = float(1 << 30)
 
 
 @dataclass(frozen=True)
@@ -154,7 +157,7 @@ class TorchBackbone(ABC):
         return self._network
 
     def _load(self, weights: Weights) -> Any:
-        with _quiet_upstream():
+        with quiet_upstream():
             network, state = self.build(read_state(weights.path), weights.config)
         load_strict(network, state, str(weights.path), self.spare_weights)
         network = network.eval().requires_grad_(False)
@@ -175,104 +178,10 @@ class TorchBackbone(ABC):
         try:
             images = torch.from_numpy(np.ascontiguousarray(np.moveaxis(canvas.rgb, 3, 1)))[None].to(self._device)
             autocast = torch.autocast(self._device.type, dtype, enabled=dtype is not None)
-            with torch.inference_mode(), autocast, _quiet_upstream():
+            with torch.inference_mode(), autocast, quiet_upstream():
                 return self.predict(network, images)
         except RuntimeError as error:
             if not is_out_of_memory(error):
                 raise
         release_memory(self._device)
         return None
-
-
-def select_device(name: str) -> Any:
-    """Return the torch device of `auto`, `cuda`, `mps` or `cpu`; raises `OptionError` for one that is not there."""
-    import torch
-
-    available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
-    if name == "auto":
-        return torch.device(next(kind for kind, there in available.items() if there))
-    if not available[name]:
-        raise OptionError(f"device: {name} is not available to torch {torch.__version__} here; choose auto or cpu")
-    return torch.device(name)
-
-
-def autocast_dtype(device: Any) -> Any:
-    """Return the reduced precision of a device: bf16 from compute capability 8, else fp16; None keeps fp32."""
-    import torch
-
-    if device.type != "cuda":
-        return None
-    return torch.bfloat16 if torch.cuda.get_device_capability(device)[0] >= 8 else torch.float16
-
-
-def limit_gpu_memory(device: Any, limit_gib: float | None) -> None:
-    """Cap what torch may take of the GPU's memory."""
-    import torch
-
-    if limit_gib is not None and device.type == "cuda":
-        total = torch.cuda.get_device_properties(device).total_memory
-        torch.cuda.set_per_process_memory_fraction(min(1.0, limit_gib * GIB / total), device)
-
-
-def gpu_memory(device: Any) -> dict[str, float]:
-    """Return the peak GPU memory since the last call in GiB, nothing on other devices."""
-    import torch
-
-    if device.type != "cuda":
-        return {}
-    peak = torch.cuda.max_memory_allocated(device) / GIB
-    torch.cuda.reset_peak_memory_stats(device)
-    return {"gpu_peak_gib": peak}
-
-
-def is_out_of_memory(error: BaseException) -> bool:
-    """Say whether an error means that a device's memory ran out."""
-    import torch
-
-    text = str(error).lower()
-    return isinstance(error, torch.OutOfMemoryError) or any(
-        phrase in text for phrase in ("out of memory", "not enough memory", "can't allocate memory")
-    )
-
-
-def release_memory(device: Any) -> None:
-    """Give cached GPU memory back after it ran out."""
-    import gc
-
-    import torch
-
-    gc.collect()
-    if device.type == "cuda":
-        torch.cuda.empty_cache()
-    elif device.type == "mps":
-        torch.mps.empty_cache()
-
-
-def to_numpy(tensor: Any) -> Float:
-    """Return a tensor as a float32 array on the host."""
-    return np.asarray(tensor.detach().float().cpu().numpy())
-
-
-def imagenet_normalised(images: Any, mean: Sequence[float], std: Sequence[float]) -> Any:
-    """Return images (..., 3, H, W) in 0..1 with mean and standard deviation per channel taken out."""
-    shape = (3, 1, 1)
-    return (images - images.new_tensor(mean).view(shape)) / images.new_tensor(std).view(shape)
-
-
-@contextmanager
-def captured(module: Any, pick: Callable[[Any], Any]) -> Iterator[list[Any]]:
-    """Collect `pick(output)` of every call of a sub-module, for tokens that a network does not return."""
-    kept: list[Any] = []
-    handle = module.register_forward_hook(lambda _module, _inputs, output: kept.append(pick(output)))
-    try:
-        yield kept
-    finally:
-        handle.remove()
-
-
-@contextmanager
-def _quiet_upstream() -> Iterator[None]:
-    """Keep upstream prints out of standard output, which carries events, and its warnings from the user."""
-    with contextlib.redirect_stdout(sys.stderr), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ..networks.torch_tools import captured, to_numpy
 from ..records import WorkingImage
 from .conventions import (
     NetworkImage,
@@ -16,7 +17,7 @@ from .conventions import (
     rigid_inverse,
     unproject,
 )
-from .torch_runtime import ModelCard, TorchBackbone, captured, to_numpy
+from .torch_runtime import ModelCard, TorchBackbone
 
 
 def prediction(answer: Mapping[str, Any], tokens: Any) -> Prediction:

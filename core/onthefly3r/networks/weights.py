@@ -49,7 +49,7 @@ def find_weights(name: str, chosen: str | None, get_them: str, hub_files: Sequen
         path = local_weights(name)
         if path is None:
             raise OptionError(
-                f"backbone {name}: no weights. {get_them} Then give --weights PATH, "
+                f"{name}: no weights. {get_them} Then give --weights PATH, "
                 f"or put the file at {weights_folder() / (name + '.safetensors')}."
             )
         return _at_path(path)

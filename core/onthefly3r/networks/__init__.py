@@ -1,0 +1,1 @@
+"""Weights and devices of neural networks, shared by backbones and retrieval descriptors."""
