@@ -242,6 +242,12 @@ def iterate_options() -> Iterator[tuple[str, dataclasses.Field[Any]]]:
             yield slice_name, item
 
 
+def check(options_slice: Any) -> None:
+    """Check every field of an option slice against its type and bounds; raises `OptionError`."""
+    for item in dataclasses.fields(options_slice):
+        _check(type(options_slice), item.name, getattr(options_slice, item.name))
+
+
 def _check(slice_class: type, name: str, value: Any) -> None:
     item = next(f for f in dataclasses.fields(slice_class) if f.name == name)
     hint = get_type_hints(slice_class)[name]
