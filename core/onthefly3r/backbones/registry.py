@@ -14,7 +14,6 @@ from .base import Backbone
 GROUP = "onthefly3r.backbones"
 BUILT_IN = {
     "classical": "onthefly3r.backbones.classical:ClassicalBackbone",
-    "oracle": "onthefly3r.simulate.oracle:OracleBackbone",  # answers from the truth of a simulated survey
     "da3": "onthefly3r.backbones.da3:DepthAnything3",
     "pi3": "onthefly3r.backbones.pi3:Pi3",
     "pi3x": "onthefly3r.backbones.pi3:Pi3X",
@@ -22,29 +21,28 @@ BUILT_IN = {
     "vggt-omega": "onthefly3r.backbones.vggt:VggtOmega",
     "mapanything": "onthefly3r.backbones.mapanything:MapAnything",
 }
-
-Factory = Callable[[BackboneOptions], Backbone]
+NEED_TRUTH = {"oracle": "onthefly3r.simulate.oracle:OracleBackbone"}  # made from a simulated survey, not from options
 
 
 def backbone_targets() -> dict[str, str]:
-    """Return `module:attribute` by name without importing anything; our own names cannot be taken over."""
+    """Return `module:attribute` of what options can make, by name, without importing it; our names stay ours."""
     offered = {point.name: point.value for point in metadata.entry_points(group=GROUP)}
-    return {**offered, **BUILT_IN}
+    return {**BUILT_IN, **{name: target for name, target in offered.items() if name not in BUILT_IN}}
 
 
-def load_backbone(name: str) -> Factory:
-    """Import the class or function that makes backbone `name` from its options.
+def load_backbone(name: str) -> Callable[..., Backbone]:
+    """Import the class or function that makes backbone `name`, from `BackboneOptions` unless it needs the truth.
 
     Raises `OptionError` for an unknown name and `MissingDependencyError` when its module cannot be imported.
     """
-    targets = backbone_targets()
+    targets = {**backbone_targets(), **NEED_TRUTH}
     if name not in targets:
         near = difflib.get_close_matches(name, targets, n=1)
         hint = f"; did you mean {near[0]}?" if near else ""
         raise OptionError(f"backbone: {name!r} is not one of {', '.join(sorted(targets))}{hint}")
     module, _, attribute = targets[name].partition(":")
     try:
-        factory: Factory = getattr(importlib.import_module(module), attribute)
+        factory: Callable[..., Backbone] = getattr(importlib.import_module(module), attribute)
     except ImportError as error:
         raise MissingDependencyError(f"backbone {name}: cannot be imported ({error}); install what it names") from error
     except AttributeError as error:
@@ -54,4 +52,9 @@ def load_backbone(name: str) -> Factory:
 
 def create_backbone(options: BackboneOptions) -> Backbone:
     """Make the backbone that the options name; raises `InputError` with the remedy when it cannot run here."""
+    if options.backbone in NEED_TRUTH:
+        raise OptionError(
+            f"backbone {options.backbone}: answers from the truth of a simulated survey, which photographs do not "
+            f"have; choose one of {', '.join(backbone_targets())}"
+        )
     return load_backbone(options.backbone)(options)

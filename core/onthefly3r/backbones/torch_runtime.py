@@ -10,7 +10,7 @@ import importlib.util
 import logging
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -61,9 +61,10 @@ class ModelCard:
         """Return the packages among torch, the upstream code and its needs that are not installed."""
         return [name for name in ("torch", self.module, *self.needs) if importlib.util.find_spec(name) is None]
 
-    def install_sentence(self) -> str:
+    def install_sentence(self, missing: Sequence[str]) -> str:
         """Return how to install what is missing."""
-        return f"pip install torch, then: {self.install}"
+        steps = ["pip install torch safetensors"] if "torch" in missing else []
+        return "; ".join(steps + ([self.install] if list(missing) != ["torch"] else []))
 
 
 class TorchBackbone(ABC):
@@ -80,7 +81,7 @@ class TorchBackbone(ABC):
         missing = self.card.missing_packages()
         if missing:
             raise MissingDependencyError(
-                f"backbone {self.card.name}: {', '.join(missing)} is not installed: {self.card.install_sentence()}"
+                f"backbone {self.card.name}: {', '.join(missing)} missing; {self.card.install_sentence(missing)}"
             )
         self._weights = find_weights(self.card.name, options.weights, self.card.weights_source, self.card.weights_files)
         self._options = options
