@@ -114,5 +114,8 @@ def _numbers(values: Sequence[float] | Float) -> str:
 
 
 def _write_lines(path: Path, lines: Iterator[str]) -> None:
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
+    with (
+        replacing(path) as temporary,
+        temporary.open("w", encoding="utf-8", errors="surrogateescape", newline="\n") as stream,
+    ):
         stream.writelines(line + "\n" for line in lines)

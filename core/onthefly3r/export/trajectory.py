@@ -17,7 +17,10 @@ def write_trajectory(path: Path, rows: Iterable[CameraRow]) -> None:
 
     Rows stay in the order given, which must be capture order: `evaluate` takes consecutive rows as consecutive shots.
     """
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
+    with (
+        replacing(path) as temporary,
+        temporary.open("w", encoding="utf-8", errors="surrogateescape", newline="") as stream,
+    ):
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(COLUMNS)
         for row in rows:

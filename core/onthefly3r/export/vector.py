@@ -64,7 +64,7 @@ def write_cameras(path: Path, rows: Iterable[CameraRow], crs: str | None) -> int
                 if position is None:
                     continue
                 writer.pointz(*position)
-                writer.record(*(_value(row, name, kind, width) for name, kind, width, _ in FIELDS))
+                writer.record(*_record(row))
                 count += 1
         temporary.with_suffix(".cpg").write_text("UTF-8", encoding="ascii")
         if crs is None:
@@ -83,14 +83,14 @@ def _esri_wkt(crs: str) -> str:
     return str(horizontal.to_2d().to_wkt("WKT1_ESRI"))
 
 
-def _value(row: CameraRow, name: str, kind: str, width: int) -> object:
-    value = getattr(row, name)
-    return _fit(value, width) if kind == "C" else value
+def _record(row: CameraRow) -> list[object]:
+    values = ((getattr(row, name), name, kind, width) for name, kind, width, _ in FIELDS)
+    return [_fit(value, width, name == "image") if kind == "C" else value for value, name, kind, width in values]
 
 
-def _fit(text: str, width: int) -> str:
-    """Shorten text to `width` bytes of UTF-8; the end stays, because that is what tells file names apart."""
-    data = text.encode("utf-8")
-    if len(data) <= width:
-        return text
-    return "..." + data[3 - width :].decode("utf-8", errors="ignore")
+def _fit(text: str, width: int, keep_end: bool) -> str:
+    """Shorten text to `width` bytes of UTF-8; of a file name the end is kept, because that tells names apart."""
+    data = text.strip().encode("utf-8", errors="replace")
+    if len(data) > width:
+        data = b"..." + data[3 - width :] if keep_end else data[: width - 3] + b"..."
+    return data.decode("utf-8", errors="ignore")
