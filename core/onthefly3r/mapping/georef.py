@@ -1,0 +1,163 @@
+"""Tie the map to the Earth: the similarity from the map to local east-north-up, and the frame of the export."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..errors import GeoreferenceError, OptionError
+from ..geometry.arrays import Float
+from ..geometry.geodesy import (
+    VERTICAL_NAMES,
+    EnuFrame,
+    WorldFrame,
+    projected_crs,
+    transformation_accuracy_m,
+    utm_crs_for,
+)
+from ..geometry.transforms import Rigid3
+from ..options import GeoreferenceOptions
+from ..records import GeoReference, Shot
+from .levelfit import LevelFit, fit
+from .positions import Positions, usable_positions
+from .updirection import UpWitness, up_witnesses
+
+MIN_POSITIONS = 3
+LINE_RATIO = 0.02  # sideways over lengthwise extent of camera centres that count as one line
+MAX_ROLL_SIGMA_DEG = 15.0  # what positions must tell about the level in its worst direction to do without gimbal
+GIMBAL = "gimbal angles"
+
+
+def georeference(
+    map_from_cam: Mapping[int, Rigid3],
+    shots: Mapping[int, Shot],
+    options: GeoreferenceOptions,
+    ground_normal: Float | None = None,
+    seed: int = 0,
+) -> GeoReference:
+    """Return the similarity that brings the map to the photographs' positions, level even where heights drift.
+
+    Args:
+        map_from_cam: poses of the placed cameras by shot index, map frame.
+        shots: at least the shots of those cameras.
+        options: target CRS, vertical reference and default accuracies.
+        ground_normal: (3,) normal of the ground plane in the map frame, away from the ground; None if unknown.
+        seed: of the random samples; the same seed gives the same result.
+
+    Raises:
+        GeoreferenceError: fewer than three usable positions, positions along one line without gimbal angles, or
+            positions that have nothing to do with the map.
+        OptionError: `options.crs` is unknown, not projected, not metric or not usable at the place.
+    """
+    images = sorted(map_from_cam)
+    positions = usable_positions(images, shots, options)
+    _require_enough(positions, len(images))
+    crs = _target_crs(options, positions.frame)
+    first_up, witnesses = up_witnesses(map_from_cam, shots, ground_normal)
+    centres = np.array([map_from_cam[i].translation for i in positions.images])
+    solution = fit(centres, positions, first_up, witnesses, seed)
+    _require_trustworthy(solution, centres, witnesses)
+    used = solution.inlier_h
+    heights = solution.inlier_h & solution.inlier_v
+    residuals = {
+        i: (float(e), float(n), float(u)) for i, (e, n, u) in zip(positions.images, solution.residuals, strict=True)
+    }
+    return GeoReference(
+        enu_from_map=solution.enu_from_map,
+        origin_lat_deg=positions.frame.lat_deg,
+        origin_lon_deg=positions.frame.lon_deg,
+        origin_height_m=positions.frame.height_m,
+        crs=crs,
+        vertical=positions.vertical,
+        method=_method(solution, positions),
+        n_used=int(used.sum()),
+        n_outliers=int((~used).sum() + (used & ~solution.inlier_v & positions.has_height).sum()),
+        rmse_h_m=float(np.sqrt((solution.residuals[used, :2] ** 2).sum(axis=1).mean())),
+        rmse_v_m=float(np.sqrt((solution.residuals[heights, 2] ** 2).mean())) if heights.any() else float("nan"),
+        residuals_m=residuals,
+        warnings=(*positions.warnings, *_warnings(solution, positions, crs)),
+    )
+
+
+def world_frame(reference: GeoReference) -> WorldFrame:
+    """Return the export frame of a georeference: local ENU -> projected CRS and heights."""
+    enu = EnuFrame(reference.origin_lat_deg, reference.origin_lon_deg, reference.origin_height_m)
+    return WorldFrame(reference.crs, reference.vertical, enu)
+
+
+def _require_enough(positions: Positions, placed: int) -> None:
+    if positions.distinct < MIN_POSITIONS:
+        raise GeoreferenceError(
+            f"{len(positions.images)} of {placed} placed photographs have a position, {positions.distinct} of them "
+            f"different; at least {MIN_POSITIONS} are needed. Use photographs with GPS tags, or ask for local "
+            "coordinates (--local)"
+        )
+
+
+def _require_trustworthy(solution: LevelFit, centres: Float, witnesses: list[UpWitness]) -> None:
+    scaled = solution.enu_from_map.scale * (centres - centres.mean(axis=0))
+    lengthwise, sideways, _ = np.linalg.svd(scaled, compute_uv=False) / np.sqrt(len(scaled))
+    enu = solution.enu_from_map.apply(centres)[:, :2]
+    extent = float(np.sqrt(enu.var(axis=0).sum()))
+    used = int(solution.inlier_h.sum())
+    if used < MIN_POSITIONS or not extent > 1.5 * solution.sigma_h_m:
+        raise GeoreferenceError(
+            f"the positions do not fit the map: {used} agree with it, and they scatter {solution.sigma_h_m:.1f} m "
+            f"about cameras that spread {extent:.1f} m. Check the GPS tags, or ask for local coordinates (--local)"
+        )
+    roll_sigma_deg = float(np.degrees(solution.position_tilt_sigma.max()))
+    vague = roll_sigma_deg > MAX_ROLL_SIGMA_DEG and sideways < 0.1 * lengthwise
+    on_a_line = sideways < LINE_RATIO * lengthwise or vague
+    if on_a_line and all(witness.name != GIMBAL for witness in witnesses):
+        raise GeoreferenceError(
+            f"the positions lie along one line ({lengthwise:.1f} m lengthwise, {sideways:.2f} m sideways, rms) and no "
+            "photograph has gimbal angles: the roll about the line stays open. Add a parallel or crossing strip, or "
+            "ask for local coordinates (--local)"
+        )
+
+
+def _target_crs(options: GeoreferenceOptions, frame: EnuFrame) -> str:
+    from pyproj.exceptions import ProjError
+
+    if options.crs is None:
+        return utm_crs_for(frame.lat_deg, frame.lon_deg)
+    projected_crs(options.crs)
+    transformation_accuracy_m(options.crs, frame.lat_deg, frame.lon_deg)
+    try:
+        there = WorldFrame(options.crs, "ellipsoidal", frame)
+        back = there.to_enu(there.from_enu(np.zeros((1, 3))))
+    except ProjError:
+        back = np.full((1, 3), np.inf)
+    if not np.abs(back).max() < 0.01:
+        raise OptionError(
+            f"crs: {options.crs} cannot be used at {frame.lat_deg:.4f}, {frame.lon_deg:.4f}; "
+            "leave it out for the UTM zone"
+        )
+    return options.crs
+
+
+def _method(solution: LevelFit, positions: Positions) -> str:
+    shares = ", ".join(f"{100.0 * share:.0f} % {name}" for name, share in solution.shares if share >= 0.005)
+    return (
+        f"robust similarity to {len(positions.images)} positions in local east-north-up; up direction from {shares}; "
+        f"scale {solution.enu_from_map.scale:.6g} m per map unit; heights: {VERTICAL_NAMES[positions.vertical]}"
+    )
+
+
+def _warnings(solution: LevelFit, positions: Positions, crs: str) -> list[str]:
+    warnings = []
+    slope_deg = float(np.degrees(np.arctan(np.linalg.norm(solution.trend))))
+    if slope_deg > 2.0 and positions.has_height.any():
+        warnings.append(
+            f"the positions' heights drift: they would tilt the survey by {slope_deg:.0f} degrees against the other "
+            "evidence, and were not followed"
+        )
+    flights = int(positions.flight.max()) + 1
+    if flights > 1:
+        warnings.append(f"{flights} flights by pauses in capture time: a height bias was estimated for each")
+    accuracy = transformation_accuracy_m(crs, positions.frame.lat_deg, positions.frame.lon_deg)
+    if not accuracy <= 1.0:
+        stated = "unknown" if np.isnan(accuracy) else f"{accuracy:g} m"
+        warnings.append(f"accuracy of the datum shift from WGS 84 to {crs}: {stated} (PROJ)")
+    return warnings
