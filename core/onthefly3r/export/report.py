@@ -1,0 +1,156 @@
+"""`report.json`: what went in, what came out, how well, how fast."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from .. import __version__
+from ..options import Options
+from ..records import GeoReference
+from .atomic import replacing
+from .las import CloudSummary
+
+
+@dataclass(frozen=True)
+class RejectedImage:
+    """A photograph that is not in the result, the stage that refused it last and why."""
+
+    image: str
+    stage: str
+    reason: str
+    numbers: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Where the time went; own time is everything but the backbone."""
+
+    total_s: float
+    backbone_s: float
+    stages: Mapping[str, float] = field(default_factory=dict)  # s
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """All that the report is made from; None where a run did not get that far."""
+
+    options: Options
+    backbone: str
+    given: int  # photographs found
+    placed: int
+    rejected: Sequence[RejectedImage]
+    timing: Timing
+    georeference: GeoReference | None = None
+    cloud: CloudSummary | None = None
+    error: str | None = None  # why the run ended early
+    warnings: Sequence[str] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)  # further figures, JSON values
+
+
+def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
+    """Return the report as JSON values: numbers that are not finite become None, paths their file name."""
+    geo, cloud, timing = run.georeference, run.cloud, run.timing
+    report: dict[str, Any] = {
+        "software": {"version": __version__, "backbone": run.backbone, "options": run.options.to_flat()},
+        "images": {
+            "given": run.given,
+            "placed": run.placed,
+            "rejected": [
+                {"image": r.image, "stage": r.stage, "reason": r.reason, "numbers": dict(r.numbers)}
+                for r in run.rejected
+            ],
+        },
+        "georeference": None
+        if geo is None
+        else {
+            "crs": geo.crs,
+            "vertical": geo.vertical,
+            "scale": geo.enu_from_map.scale,
+            "n_used": geo.n_used,
+            "n_outliers": geo.n_outliers,
+            "rmse_h_m": geo.rmse_h_m,
+            "rmse_v_m": geo.rmse_v_m,
+            "method": geo.method,
+        },
+        "cloud": None
+        if cloud is None
+        else {
+            "path": cloud.path.name,
+            "points": cloud.points,
+            "bounds": list(cloud.bounds),
+            "mean_spacing_m": cloud.mean_spacing_m,
+        },
+        "timing": {
+            "total_s": timing.total_s,
+            "per_image_s": timing.total_s / run.given if run.given else None,
+            "stages": dict(timing.stages),
+            "backbone_s": timing.backbone_s,
+            "own_s": timing.total_s - timing.backbone_s,
+        },
+        "memory": {"peak_rss_mib": peak_rss_mib},
+        "error": run.error,
+        "warnings": [*run.warnings, *(geo.warnings if geo else ())],
+        "details": dict(run.details),
+    }
+    return dict(_plain(report))
+
+
+def write_report(path: Path, report: Mapping[str, Any]) -> None:
+    """Write the report as strict JSON (no NaN), UTF-8, atomically."""
+    text = json.dumps(_plain(report), indent=2, ensure_ascii=False, allow_nan=False)
+    with replacing(path) as temporary:
+        # Undecodable file names become \udcxx escapes, which are valid JSON.
+        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace", newline="\n")
+
+
+def peak_rss_mib() -> float | None:
+    """Return the most memory this process has had resident, MiB; None where the system does not tell."""
+    if sys.platform == "win32":
+        return _peak_working_set_mib()
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024.0**2 if sys.platform == "darwin" else 1024.0)  # bytes on macOS, KiB elsewhere
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):  # numpy
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    return str(value)
+
+
+def _peak_working_set_mib() -> float | None:
+    import ctypes
+    from ctypes import wintypes
+
+    class Counters(ctypes.Structure):  # PROCESS_MEMORY_COUNTERS of psapi.h
+        _fields_ = (
+            ("cb", wintypes.DWORD),
+            ("PageFaultCount", wintypes.DWORD),
+            *((name, ctypes.c_size_t) for name in ("PeakWorkingSetSize", "WorkingSetSize")),
+            *((f"Quota{i}", ctypes.c_size_t) for i in range(4)),
+            *((name, ctypes.c_size_t) for name in ("PagefileUsage", "PeakPagefileUsage")),
+        )
+
+    counters = Counters(cb=ctypes.sizeof(Counters))
+    kernel = ctypes.WinDLL("kernel32")  # type: ignore[attr-defined,unused-ignore]
+    kernel.GetCurrentProcess.restype = wintypes.HANDLE
+    query = kernel.K32GetProcessMemoryInfo
+    query.argtypes = (wintypes.HANDLE, ctypes.POINTER(Counters), wintypes.DWORD)
+    if not query(kernel.GetCurrentProcess(), ctypes.byref(counters), counters.cb):
+        return None
+    return float(counters.PeakWorkingSetSize) / 1024.0**2
