@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+
+from onthefly3r.doctor import PACKAGES, check_package
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -21,3 +24,14 @@ def photograph_sets() -> Path:
             "in the variable ONTHEFLY3R_PHOTOGRAPHS"
         )
     return folder
+
+
+@pytest.fixture(scope="session")
+def open3d() -> ModuleType:
+    """The package open3d, tried in another process first; without its system libraries the test is left out."""
+    check = check_package(next(package for package in PACKAGES if package.module == "open3d"))
+    if check.status != "ok":
+        pytest.skip(f"open3d: {check.found}; {check.remedy}")
+    import open3d
+
+    return open3d

@@ -5,17 +5,21 @@ Exit codes: 0 done, 2 the input is wrong, 3 nothing reconstructed or georeferenc
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from . import __version__
-from .command_options import run_options, with_run_options
+from .command_options import given, run_options, with_options_of, with_run_options
 from .console import session, use_utf8
 from .errors import InputError
+from .options import check
+from .simulate.flight import SurveyOptions
 
 if TYPE_CHECKING:
+    from .demo import Demo
     from .engine import Result
 
 app = typer.Typer(
@@ -84,6 +88,36 @@ def export(
 
 
 @app.command()
+@with_options_of(SurveyOptions, "Survey")
+def simulate(out: Out, json: JsonLines = False, **values: Any) -> None:
+    """Render a made-up survey: photographs with tags in OUT/photos, the truth in OUT/truth."""
+    with session(json_lines=json, crash_folder=out) as here:
+        options = SurveyOptions(**given(values))
+        check(options)
+        from .simulate import simulate_survey
+
+        survey = simulate_survey(out, options, here.progress)
+        data = {"photos": str(out / "photos"), "truth": str(out / "truth"), "given": len(survey.views)}
+        here.reporter.result(data, {name: str(value) for name, value in data.items()})
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder; it is made")] = Path("demo-survey"),
+    json: JsonLines = False,
+) -> None:
+    """Render a small survey, reconstruct its photographs, and say how far the result is from the truth."""
+    with session(json_lines=json, crash_folder=out) as here:
+        from .demo import run_demo
+
+        shown = run_demo(out, here.progress, here.cancelled)
+        here.reporter.result(
+            {**_result_data(shown.result), "accuracy": asdict(shown.accuracy)},
+            {**_result_summary(shown.result), **_demo_summary(shown)},
+        )
+
+
+@app.command()
 def doctor(
     json: Annotated[bool, typer.Option("--json", help="print one JSON object", show_default=False)] = False,
 ) -> None:
@@ -125,6 +159,20 @@ def _result_data(result: Result) -> dict[str, Any]:
         **{name: None if path is None else str(path) for name, path in paths.items()},
         "placed": result.placed,
         "given": result.given,
+    }
+
+
+def _demo_summary(demo: Demo) -> dict[str, str]:
+    """Return how far the demonstration is from the truth, and where its pictures are."""
+    a = demo.accuracy
+    return {
+        "preview": str(demo.out / "result" / "preview.png"),
+        "photographs": str(demo.out / "photos"),
+        "truth": str(demo.out / "truth"),
+        "camera error": f"{a.ate_m:.3f} m, {a.ate_percent:.2f} % of the flying height (ATE, {a.cameras} cameras)",
+        "on the ground": f"{a.camera_absolute_h_m:.3f} m horizontally, {a.camera_absolute_v_m:.3f} m vertically",
+        "cloud error": f"{a.cloud_fitted_m:.3f} m to the true surface, {a.cloud_fitted_gsd:.2f} GSD "
+        f"(GSD {a.gsd_m:.3f} m); {a.cloud_absolute_m:.3f} m as georeferenced",
     }
 
 

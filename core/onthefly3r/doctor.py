@@ -149,18 +149,18 @@ def check_package(package: Package) -> Check:
 
 
 def missing_libraries(module: str, told: str) -> tuple[str, ...]:
-    """Return the system libraries that an import failed for: the one it named, and all that ldd finds missing."""
+    """Return the system libraries that an import failed for: the one it named, and known ones that ldd finds missing.
+
+    The import names one at a time. ldd finds more than the import needs (parts made for other packages), so of its
+    findings only libraries of the system count.
+    """
     named = set(re.findall(r"(lib[\w.+-]+\.so[.\d]*): cannot open shared object", told))
     spec = importlib.util.find_spec(module)
-    if not named or spec is None or spec.origin is None or shutil.which("ldd") is None:
-        return tuple(sorted(named))
-    folder = Path(spec.origin).parent
-    # Libraries that come with the wheel lie in the package or beside it, and are found at run time.
-    bundled = {path.name for path in (*folder.rglob("*.so*"), *folder.parent.glob("*.libs/*.so*"))}
-    for library in folder.rglob("*.so*"):
-        told = subprocess.run(["ldd", str(library)], capture_output=True, text=True, check=False).stdout  # noqa: S607
-        named.update(re.findall(r"^\s*(\S+) => not found", told, flags=re.MULTILINE))
-    return tuple(sorted(named - bundled))
+    if named and spec is not None and spec.origin is not None and shutil.which("ldd") is not None:
+        for library in Path(spec.origin).parent.rglob("*.so*"):
+            linked = subprocess.run(["ldd", str(library)], capture_output=True, text=True, check=False).stdout  # noqa: S607
+            named |= set(re.findall(r"^\s*(\S+) => not found", linked, flags=re.MULTILINE)) & APT_PACKAGES.keys()
+    return tuple(sorted(named))
 
 
 def library_remedy(libraries: tuple[str, ...]) -> str:
