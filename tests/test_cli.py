@@ -305,3 +305,14 @@ def test_doctor_reports_crashing_and_broken_packages(tmp_path: Path, monkeypatch
     assert (absent.status, absent.remedy) == ("missing", "pip install absent")
     assert not doctor.is_fit([crashed, lacks])
     assert doctor.is_fit([lacks])
+
+
+def test_view_says_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    (tmp_path / "cloud.laz").touch()
+    cases = [(tmp_path, "onthefly3r[cloud]"), (tmp_path / "none.laz", "does not exist")]
+    (tmp_path / "empty").mkdir()
+    for path, told in [*cases, (tmp_path / "empty", "holds no cloud")]:
+        shown = call("view", path)
+        assert shown.exit_code == 2
+        assert told in shown.stderr

@@ -118,6 +118,17 @@ def demo(
 
 
 @app.command()
+def view(
+    cloud: Annotated[Path, typer.Argument(metavar="CLOUD", help="LAS or LAZ cloud, or the output folder of a run")],
+) -> None:
+    """Show a cloud in a window (needs the extra cloud)."""
+    with session(json_lines=False, polite=False):
+        from .viewer import view_cloud
+
+        view_cloud(cloud)
+
+
+@app.command()
 def doctor(
     json: Annotated[bool, typer.Option("--json", help="print one JSON object", show_default=False)] = False,
 ) -> None:
