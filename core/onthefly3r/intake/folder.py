@@ -76,10 +76,18 @@ def _duplicates(folder: Path, paths: list[Path]) -> dict[str, RefusedPhotograph]
         for path in same_size:
             name = path.relative_to(folder).as_posix()
             try:
-                digest = hashlib.blake2b(path.read_bytes()).hexdigest()
+                digest = _digest(path)
             except OSError:
                 continue
             kept = first.setdefault(digest, name)
             if kept != name:
                 refused[name] = RefusedPhotograph(name, f"the same file as {kept}")
     return refused
+
+
+def _digest(path: Path) -> str:
+    digest = hashlib.blake2b()
+    with path.open("rb") as stream:
+        while block := stream.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff"})
-FORMATS = ("JPEG", "MPO", "PNG", "TIFF")  # MPO: JPEG with a preview appended, as some drones write
+FORMATS = ("JPEG", "PNG", "TIFF")  # the JPEG reader also takes MPO, a JPEG with a preview appended
 MAX_PIXELS = 400_000_000
 READABLE_MODES = frozenset({"1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "I;16", "I;16B", "I"})
 
@@ -26,8 +26,9 @@ def opened(path: Path, name: str) -> Iterator[Image]:
     Raises `PhotographError` for files that are empty, no JPEG/PNG/TIFF, larger than 400 Mpx or of a pixel
     type that is no photograph.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image, JpegImagePlugin, MpoImagePlugin, PngImagePlugin, TiffImagePlugin, UnidentifiedImageError
 
+    del JpegImagePlugin, MpoImagePlugin, PngImagePlugin, TiffImagePlugin  # importing a reader is what registers it
     # Pillow's own limit is a process-wide warning at 89 Mpx, below today's cameras; ours is checked right below.
     Image.MAX_IMAGE_PIXELS = None
     try:
