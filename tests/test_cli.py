@@ -316,3 +316,30 @@ def test_view_says_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         shown = call("view", path)
         assert shown.exit_code == 2
         assert told in shown.stderr
+
+
+def test_refused_reconstruction_names_its_report(engine: FakeEngine, tmp_path: Path) -> None:
+    def refuse() -> None:
+        (tmp_path / "out").mkdir()
+        (tmp_path / "out" / "report.json").touch()
+        raise GeoreferenceError("only 2 usable positions: name --local")
+
+    engine.trouble = refuse
+    shown = call("run", tmp_path, tmp_path / "out")
+    assert shown.exit_code == 3
+    assert "only 2 usable positions" in shown.stderr
+    assert str(tmp_path / "out" / "report.json") in shown.stderr
+
+
+def test_warnings_of_the_report_are_told_once(
+    engine: FakeEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def warn() -> None:
+        logging.getLogger("onthefly3r").warning("heights drift")
+
+    engine.trouble = warn
+    monkeypatch.setitem(REPORT, "warnings", ["heights drift", "3 photographs without a position"])
+    shown = call("run", tmp_path, tmp_path / "out", "--json")
+    events = [Event.from_line(line) for line in shown.stdout.splitlines()]
+    warnings = [event.data["message"] for event in events if event.kind == "warning"]
+    assert warnings == ["heights drift", "3 photographs without a position"]

@@ -14,13 +14,16 @@ import pytest
 
 from onthefly3r.demo import compare_with_truth, run_demo
 from onthefly3r.errors import Cancelled, InputError
+from onthefly3r.geometry.frames import omega_phi_kappa_deg
 from onthefly3r.geometry.geodesy import EnuFrame, WorldFrame
+from onthefly3r.geometry.transforms import rotation_exp
 from onthefly3r.options import Options
 from onthefly3r.protocol import Progress
 from onthefly3r.simulate.flight import Survey, SurveyOptions, plan_survey
 
 SMALL = SurveyOptions(images=6, strips=2, image_width_px=400, image_height_px=300)
 SHIFT_M = np.array([0.3, 0.0, 0.4])  # east, north, up
+ROLL_RAD = np.radians([0.0, 0.0, 0.2])  # of every camera about its viewing axis
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,9 @@ def write_shifted_truth(survey: Survey, folder: Path, noise_m: float) -> FakeRes
     noise = noise_m * np.random.default_rng(0).standard_normal(centres.shape)
     lines = ["image,x,y,z,omega,phi,kappa,status"]
     for view, (x, y, z) in zip(survey.views[:-1], world.from_enu(centres + SHIFT_M + noise), strict=False):
-        lines.append(f"{view.name},{x:.6f},{y:.6f},{z:.6f},0,0,0,placed")
+        rotation = world.rotation_world_from_enu() @ view.enu_from_cam.rotation @ rotation_exp(ROLL_RAD)
+        omega, phi, kappa = omega_phi_kappa_deg(rotation)
+        lines.append(f"{view.name},{x:.6f},{y:.6f},{z:.6f},{omega:.6f},{phi:.6f},{kappa:.6f},placed")
     lines.append(f"{survey.views[-1].name},,,,,,,rejected")
     (folder / "trajectory.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     points = survey.scene.sample_surface(20_000, seed=0).points
@@ -58,6 +63,7 @@ def test_figures_tell_shift_from_shape(tmp_path: Path) -> None:
     figures = compare_with_truth(result.report, tmp_path / "result", survey, Options())
     assert figures.cameras == 5
     assert figures.ate_m < 1e-4
+    assert figures.are_deg == pytest.approx(0.2, abs=1e-3)
     assert figures.camera_absolute_h_m == pytest.approx(0.3, abs=1e-4)
     assert figures.camera_absolute_v_m == pytest.approx(0.4, abs=1e-4)
     assert figures.cloud_points == result.report["cloud"]["points"]

@@ -60,12 +60,14 @@ def run(
     **values: Any,
 ) -> None:
     """Reconstruct a folder of photographs: cloud, cameras and report in OUT."""
-    with session(json_lines=json, crash_folder=out) as here:
+    with session(json_lines=json, out=out) as here:
         options = run_options(values)
         _require_folder(photos, "PHOTOS")
         from .engine import reconstruct
 
         result = reconstruct(photos, out, options, here.progress, here.cancelled)
+        for warning in result.report.get("warnings", ()):
+            here.warning(warning)
         here.reporter.result(_result_data(result), _result_summary(result))
 
 
@@ -78,7 +80,7 @@ def export(
     **values: Any,
 ) -> None:
     """Write the files of an earlier run again, with another CRS, format or spacing, into OUT."""
-    with session(json_lines=json, crash_folder=out) as here:
+    with session(json_lines=json, out=out) as here:
         options = run_options(values)
         _require_folder(result, "RESULT")
         from .engine import export_again
@@ -91,7 +93,7 @@ def export(
 @with_options_of(SurveyOptions, "Survey")
 def simulate(out: Out, json: JsonLines = False, **values: Any) -> None:
     """Render a made-up survey: photographs with tags in OUT/photos, the truth in OUT/truth."""
-    with session(json_lines=json, crash_folder=out) as here:
+    with session(json_lines=json, out=out) as here:
         options = SurveyOptions(**given(values))
         check(options)
         from .simulate import simulate_survey
@@ -107,7 +109,7 @@ def demo(
     json: JsonLines = False,
 ) -> None:
     """Render a small survey, reconstruct its photographs, and say how far the result is from the truth."""
-    with session(json_lines=json, crash_folder=out) as here:
+    with session(json_lines=json, out=out) as here:
         from .demo import run_demo
 
         shown = run_demo(out, here.progress, here.cancelled)
@@ -126,6 +128,15 @@ def view(
         from .viewer import view_cloud
 
         view_cloud(cloud)
+
+
+@app.command()
+def backbones() -> None:
+    """List the local reconstructors, what each needs here, and what to do next."""
+    from .backbones.listing import print_backbones
+
+    with session(json_lines=False, polite=False):
+        print_backbones()
 
 
 @app.command()
@@ -180,7 +191,8 @@ def _demo_summary(demo: Demo) -> dict[str, str]:
         "preview": str(demo.out / "result" / "preview.png"),
         "photographs": str(demo.out / "photos"),
         "truth": str(demo.out / "truth"),
-        "camera error": f"{a.ate_m:.3f} m, {a.ate_percent:.2f} % of the flying height (ATE, {a.cameras} cameras)",
+        "camera error": f"{a.ate_m:.3f} m, {a.ate_percent:.2f} % of the flying height (ATE), "
+        f"{a.are_deg:.3f} degrees (ARE), {a.cameras} cameras",
         "on the ground": f"{a.camera_absolute_h_m:.3f} m horizontally, {a.camera_absolute_v_m:.3f} m vertically",
         "cloud error": f"{a.cloud_fitted_m:.3f} m to the true surface, {a.cloud_fitted_gsd:.2f} GSD "
         f"(GSD {a.gsd_m:.3f} m); {a.cloud_absolute_m:.3f} m as georeferenced",

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from . import protocol
-from .errors import Cancelled, MissingDependencyError, OnTheFly3RError
+from .errors import Cancelled, MissingDependencyError, OnTheFly3RError, ReconstructionError
 
 # Failures of the disk or of permissions: the user can mend them, a traceback would not help.
 _DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG)
@@ -135,6 +135,7 @@ class Session:
     def __init__(self, reporter: HumanReporter | JsonReporter) -> None:
         self.reporter = reporter
         self.stop_asked = False
+        self._warned: set[str] = set()
 
     def cancelled(self) -> bool:
         """Return whether Ctrl-C or a termination signal arrived."""
@@ -146,22 +147,30 @@ class Session:
             raise Cancelled("stopped on request")
         self.reporter.progress(report)
 
+    def warning(self, message: str) -> None:
+        """Tell a warning once."""
+        if message not in self._warned:
+            self._warned.add(message)
+            self.reporter.warning(message)
+
 
 @contextlib.contextmanager
-def session(*, json_lines: bool, crash_folder: Path | None = None, polite: bool = True) -> Iterator[Session]:
+def session(*, json_lines: bool, out: Path | None = None, polite: bool = True) -> Iterator[Session]:
     """Run a command's body: errors become one sentence and an exit code, never a traceback.
 
     With `polite`, the first Ctrl-C or termination signal asks the work to stop at its next report and the second
-    ends it; without, the first ends it. Unexpected errors leave a traceback in `crash_folder`.
+    ends it; without, the first ends it. `out` is the output folder: an unexpected error leaves its traceback there.
     """
     with JsonReporter() if json_lines else HumanReporter() as reporter:
         here = Session(reporter)
-        with _signals(here, polite), _warnings_to(reporter):
+        with _signals(here, polite), _warnings_to(here):
             try:
                 yield here
                 return
             except OnTheFly3RError as error:
                 message, exit_code = str(error), error.exit_code
+                if isinstance(error, ReconstructionError) and out and (out / "report.json").is_file():
+                    message += f"; the report is in {out / 'report.json'}"
             except (KeyboardInterrupt, BrokenPipeError):
                 message, exit_code = "stopped on request", Cancelled.exit_code
             except MemoryError:
@@ -171,11 +180,9 @@ def session(*, json_lines: bool, crash_folder: Path | None = None, polite: bool 
                 exit_code = MissingDependencyError.exit_code
             except Exception as error:
                 if isinstance(error, OSError) and error.errno in _DISK_TROUBLE:
-                    message, exit_code = f"{error.strerror}: {error.filename or crash_folder}", 2
+                    message, exit_code = f"{error.strerror}: {error.filename or out}", 2
                 else:
-                    message = (
-                        f"unexpected {type(error).__name__}: {error}; the traceback is in {_note_crash(crash_folder)}"
-                    )
+                    message = f"unexpected {type(error).__name__}: {error}; the traceback is in {_note_crash(out)}"
                     exit_code = 1
         with contextlib.suppress(BrokenPipeError):
             reporter.error(message, exit_code)
@@ -199,12 +206,12 @@ def _signals(here: Session, polite: bool) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _warnings_to(reporter: HumanReporter | JsonReporter) -> Iterator[None]:
+def _warnings_to(here: Session) -> Iterator[None]:
     """Pass what the package logs as a warning to the user."""
 
     class Handler(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            reporter.warning(record.getMessage())
+            here.warning(record.getMessage())
 
     logger = logging.getLogger("onthefly3r")
     handler = Handler(logging.WARNING)

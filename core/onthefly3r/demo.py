@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -12,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .errors import InputError
+from .evaluate.clouds import open_cloud
+from .evaluate.poses import PoseSet, match
+from .evaluate.readers import read_trajectory_csv
+from .evaluate.trajectory import pose_errors
 from .geometry.arrays import Float
 from .geometry.geodesy import EnuFrame, WorldFrame
-from .geometry.transforms import Sim3
-from .geometry.umeyama import weighted_similarity
 from .options import Options
 from .protocol import ProgressCallback
 
@@ -37,6 +38,7 @@ class Accuracy:
     cameras: int
     ate_m: float  # fitted
     ate_percent: float  # of the flying height
+    are_deg: float  # fitted
     camera_absolute_h_m: float
     camera_absolute_v_m: float
     cloud_points: int  # of which a sample was measured
@@ -85,60 +87,42 @@ def compare_with_truth(report: dict[str, Any], folder: Path, survey: Survey, opt
     """Measure the trajectory and the cloud in `folder` in the survey's east-north-up frame."""
     georeference = report["georeference"]
     origin = survey.origin
-    world = WorldFrame(
-        georeference["crs"], georeference["vertical"], EnuFrame(origin.lat_deg, origin.lon_deg, origin.height_m)
-    )
-    true_centres = {view.name: view.enu_from_cam.translation for view in survey.views}
-    placed = _placed_centres(folder / "trajectory.csv")
-    names = sorted(placed.keys() & true_centres.keys())
-    estimated = world.to_enu(np.array([placed[name] for name in names]))
-    true = np.array([true_centres[name] for name in names])
-    true_from_estimated = weighted_similarity(estimated, true, np.ones(len(names)))
-    ate_m = _rms(true_from_estimated.apply(estimated) - true)
+    enu = EnuFrame(origin.lat_deg, origin.lon_deg, origin.height_m)
+    world = WorldFrame(georeference["crs"], georeference["vertical"], enu)
+    poses = read_trajectory_csv(folder / "trajectory.csv")
+    rotations = world.rotation_world_from_enu().T @ poses.rotations
+    estimate = PoseSet(poses.source, poses.names, world.to_enu(poses.centres), rotations)
+    names = [view.name for view in survey.views]
+    truth = PoseSet.from_poses(folder, names, [view.enu_from_cam for view in survey.views])
+    fitted = pose_errors(estimate, truth)
+    rows, true_rows = match(estimate, truth)
+    offsets = estimate.centres[rows] - truth.centres[true_rows]
 
-    points, n_points = _sample_cloud(folder / report["cloud"]["path"])
-    points = world.to_enu(points)
-    fitted_m = _mean_distance(survey, points, true_from_estimated)
+    cloud = open_cloud(folder / report["cloud"]["path"])
+    step = max(1, cloud.n_points // CLOUD_SAMPLE)
+    points = world.to_enu(np.concatenate([chunk[::step] for chunk in cloud.chunks()]))
+    cloud_fitted_m = _mean_distance(survey, fitted.reference_from_estimate.apply(points))
     camera = survey.views[0].camera
     longest_px = max(camera.width, camera.height)
     working_px = min(longest_px, options.backbone.working_px)
     gsd_m = survey.options.altitude_m / camera.fx * longest_px / working_px
     return Accuracy(
-        cameras=len(names),
-        ate_m=ate_m,
-        ate_percent=100.0 * ate_m / survey.options.altitude_m,
-        camera_absolute_h_m=_rms((estimated - true)[:, :2]),
-        camera_absolute_v_m=_rms((estimated - true)[:, 2:]),
-        cloud_points=n_points,
-        cloud_absolute_m=_mean_distance(survey, points, Sim3()),
-        cloud_fitted_m=fitted_m,
-        cloud_fitted_gsd=fitted_m / gsd_m,
+        cameras=fitted.n_common,
+        ate_m=fitted.ate,
+        ate_percent=100.0 * fitted.ate / survey.options.altitude_m,
+        are_deg=fitted.are_deg,
+        camera_absolute_h_m=_rms(offsets[:, :2]),
+        camera_absolute_v_m=_rms(offsets[:, 2:]),
+        cloud_points=cloud.n_points,
+        cloud_absolute_m=_mean_distance(survey, points),
+        cloud_fitted_m=cloud_fitted_m,
+        cloud_fitted_gsd=cloud_fitted_m / gsd_m,
         gsd_m=gsd_m,
     )
 
 
-def _placed_centres(trajectory: Path) -> dict[str, tuple[float, float, float]]:
-    with trajectory.open(encoding="utf-8", newline="") as stream:
-        return {
-            row["image"]: (float(row["x"]), float(row["y"]), float(row["z"]))
-            for row in csv.DictReader(stream)
-            if row["x"]
-        }
-
-
-def _sample_cloud(path: Path) -> tuple[Float, int]:
-    """Return evenly picked points (N, 3) of a LAS or LAZ file, and how many it holds."""
-    import laspy
-
-    with laspy.open(path) as reader:
-        total = int(reader.header.point_count)
-        step = max(1, total // CLOUD_SAMPLE)
-        chunks = [np.column_stack([chunk.x, chunk.y, chunk.z])[::step] for chunk in reader.chunk_iterator(1000 * step)]
-    return np.concatenate(chunks), total
-
-
-def _mean_distance(survey: Survey, points: Float, true_from_points: Sim3) -> float:
-    return float(np.mean(survey.scene.distance_to_surface(true_from_points.apply(points))))
+def _mean_distance(survey: Survey, points: Float) -> float:
+    return float(np.mean(survey.scene.distance_to_surface(points)))
 
 
 def _rms(errors: Float) -> float:
