@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ..protocol import Progress, ProgressCallback
+from .flight import Survey, SurveyOptions, TrueView, plan_survey
+from .photographs import render, write_photograph
+from .truth import write_truth
 
-if TYPE_CHECKING:
-    from .flight import Survey, SurveyOptions
-
-__all__ = ["simulate_survey"]
+__all__ = ["Survey", "SurveyOptions", "TrueView", "plan_survey", "simulate_survey"]
 
 
 def simulate_survey(out: Path, options: SurveyOptions, progress: ProgressCallback | None = None) -> Survey:
@@ -18,18 +19,17 @@ def simulate_survey(out: Path, options: SurveyOptions, progress: ProgressCallbac
 
     The same options give the same survey. Raises `OptionError` for a plan that cannot be flown.
     """
-    from .flight import plan_survey
-    from .photographs import photograph_survey_view
-    from .truth import write_truth
-
     survey = plan_survey(options)
-    photos = out / "photos"
-    photos.mkdir(parents=True, exist_ok=True)
+
+    def photograph(view: TrueView) -> None:
+        write_photograph(out / "photos" / view.name, render(survey.scene, view), view)
+
     write_truth(survey, out / "truth")
-    for done, view in enumerate(survey.views):
-        if progress is not None:
-            progress(Progress("simulate", done, len(survey.views)))
-        photograph_survey_view(survey, view, photos)
+    count = len(survey.views)
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        for done, _ in enumerate(pool.map(photograph, survey.views)):
+            if progress is not None:
+                progress(Progress("simulate", done, count))
     if progress is not None:
-        progress(Progress("simulate", len(survey.views), len(survey.views)))
+        progress(Progress("simulate", count, count))
     return survey

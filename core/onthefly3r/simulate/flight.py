@@ -12,11 +12,14 @@ from ..errors import OptionError
 from ..geometry.arrays import Float
 from ..geometry.camera import Camera
 from ..geometry.frames import enu_from_cam_rotation, gimbal_angles_deg
+from ..geometry.geodesy import EnuFrame, undulation_m
 from ..geometry.transforms import Rigid3, rotation_exp
-from ..options import option
-from ..records import Attitude, GpsFix
+from ..options import check, option
+from ..records import Attitude, GpsFix, VerticalReference
 from .scene import Scene, make_scene
 
+DEFAULT_ORIGIN = EnuFrame(lat_deg=48.2, lon_deg=15.6, height_m=300.0)
+RTK_FIXED = 50  # DJI RtkFlag
 FOCAL_RATIO = 0.68  # focal length / image width: what 24 mm (35-mm equivalent) promises, give or take 2 %
 START_TIME_S = 1717236000.0  # 2024-06-01 10:00:00 UTC
 SHOT_INTERVAL_S = 2.0
@@ -44,7 +47,9 @@ class SurveyOptions:
     image_width_px: int = option(1000, "width of the photographs", unit="px", minimum=200, maximum=8000)
     image_height_px: int = option(750, "height of the photographs", unit="px", minimum=200, maximum=8000)
     distorted: bool = option(False, "give the lens radial and tangential distortion")
-    rtk: bool = option(True, "write the tags of an RTK drone; heights in the tags are ellipsoidal in any case")
+    rtk: bool = option(
+        True, "write the tags of an RTK drone, with ellipsoidal heights; otherwise above the EGM96 geoid"
+    )
     gps_sigma_h_m: float = option(0.03, "horizontal noise of the positions in the tags", unit="m", minimum=0.0)
     gps_sigma_v_m: float = option(0.05, "vertical noise of the positions in the tags", unit="m", minimum=0.0)
     height_bias_m: float = option(
@@ -56,22 +61,13 @@ class SurveyOptions:
 
 
 @dataclass(frozen=True)
-class Origin:
-    """Where the local east-north-up frame touches the Earth: WGS 84, ellipsoidal height."""
-
-    lat_deg: float = 48.2
-    lon_deg: float = 15.6
-    height_m: float = 300.0
-
-
-@dataclass(frozen=True)
 class TrueView:
     """One photograph: the truth, and what its tags will say."""
 
     name: str
     camera: Camera  # at photograph size
     enu_from_cam: Rigid3
-    gps: GpsFix  # noisy, ellipsoidal height
+    gps: GpsFix  # noisy, as written into the tags
     attitude: Attitude  # noisy
     time_s: float
     flight: int
@@ -83,13 +79,14 @@ class Survey:
 
     scene: Scene
     views: tuple[TrueView, ...]
-    origin: Origin
+    origin: EnuFrame  # where the local east-north-up frame touches the Earth
     options: SurveyOptions
 
 
-def plan_survey(options: SurveyOptions, origin: Origin | None = None) -> Survey:
+def plan_survey(options: SurveyOptions, origin: EnuFrame | None = None) -> Survey:
     """Return the flight over a landscape that is made to fit it; raises `OptionError` for an impossible plan."""
-    origin = origin or Origin()
+    check(options)
+    origin = origin or DEFAULT_ORIGIN
     rng = np.random.default_rng((options.seed, 1))
     camera = _camera(options)
     stations = _remove_gaps(_stations(options, camera), options, rng)
@@ -192,25 +189,19 @@ def _remove_gaps(stations: list[_Station], options: SurveyOptions, rng: np.rando
     return [s for i, s in enumerate(stations) if i not in missing]
 
 
-def _gps_fixes(positions: Float, origin: Origin, options: SurveyOptions) -> list[GpsFix]:
-    """Return positions (N, 3) in local ENU as WGS 84 fixes."""
-    lon, lat, height = geodetic_from_enu(positions, origin).T
-    sigma_h_m = options.gps_sigma_h_m if options.rtk else None
-    sigma_v_m = options.gps_sigma_v_m if options.rtk else None
-    rtk = 50 if options.rtk else None
+def _gps_fixes(positions: Float, origin: EnuFrame, options: SurveyOptions) -> list[GpsFix]:
+    """Return positions (N, 3) in local ENU as the fixes that an RTK drone (ellipsoidal) or another (EGM96) writes."""
+    geographic = origin.to_geographic(positions)
+    vertical = tag_vertical(options)
+    geographic[:, 2] -= undulation_m(vertical, geographic[:, 0], geographic[:, 1])
+    sigma_h_m, sigma_v_m = (options.gps_sigma_h_m, options.gps_sigma_v_m) if options.rtk else (None, None)
+    rtk = RTK_FIXED if options.rtk else None
     return [
-        GpsFix(float(lat_deg), float(lon_deg), float(height_m), "ellipsoidal", sigma_h_m, sigma_v_m, rtk)
-        for lat_deg, lon_deg, height_m in zip(lat, lon, height, strict=True)
+        GpsFix(float(lat_deg), float(lon_deg), float(height_m), vertical, sigma_h_m, sigma_v_m, rtk)
+        for lat_deg, lon_deg, height_m in geographic
     ]
 
 
-def geodetic_from_enu(points: Float, origin: Origin) -> Float:
-    """Return longitude, latitude (degrees) and ellipsoidal height (m) (N, 3) of points (N, 3) in local ENU."""
-    import pyproj
-
-    to_geocentric = pyproj.Transformer.from_pipeline(
-        "+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 "
-        f"+lon_0={origin.lon_deg!r} +lat_0={origin.lat_deg!r} +h_0={origin.height_m!r} "
-        "+step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
-    )
-    return np.stack(to_geocentric.transform(*np.asarray(points, float).T), axis=-1)
+def tag_vertical(options: SurveyOptions) -> VerticalReference:
+    """Return what the heights in the tags refer to."""
+    return "ellipsoidal" if options.rtk else "egm96"

@@ -96,9 +96,7 @@ class OracleBackbone:
         if index not in self._depths:
             view = self._survey.views[index]
             grid = grid_camera(view.camera)
-            rays = grid.rays(grid.pixel_centres()).reshape(-1, 3)
-            hits = self._survey.scene.cast(view.enu_from_cam.translation, rays @ view.enu_from_cam.rotation.T)
-            # Rays have z = 1 in the camera frame, so that the hit distance is the depth.
+            hits = self._survey.scene.view(grid, view.enu_from_cam, grid.pixel_centres())
             self._depths[index] = hits.distances.reshape(grid.height, grid.width).astype(np.float32)
             if len(self._depths) > CACHED_DEPTH_MAPS:
                 self._depths.popitem(last=False)

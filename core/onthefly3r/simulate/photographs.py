@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import time
 import zlib
@@ -10,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from ..export.atomic import replacing
 from ..geometry.arrays import UInt8
-from ..records import GpsFix
-from .flight import Survey, TrueView
+from .flight import TrueView
 from .scene import Scene
 
 SUPERSAMPLING = 1.5  # samples per pixel side: smooths the outlines of houses
 SENSOR_NOISE = 1.5  # standard deviation in grey levels
+BAND_ROWS = 128
 FOCAL_35MM = 24
 FOCAL_MM = 8.8
 MAKER, MODEL = "OnTheFly3R", "Simulator"
@@ -28,32 +28,26 @@ def render(scene: Scene, view: TrueView, supersampling: float = SUPERSAMPLING) -
     import cv2
 
     fine = view.camera.resized(round(view.camera.width * supersampling), round(view.camera.height * supersampling))
-    rays = fine.rays(fine.pixel_centres()).reshape(-1, 3)
-    hits = scene.cast(view.enu_from_cam.translation, rays @ view.enu_from_cam.rotation.T)
-    distance_m = float(np.nanmedian(hits.distances)) if (hits.faces >= 0).any() else 1.0
-    image = scene.colour(hits, footprint_m=distance_m / fine.fx).reshape(fine.height, fine.width, 3)
+    footprint_m = abs(float(view.enu_from_cam.translation[2])) / fine.fx
+    pixels = fine.pixel_centres()
+    bands = []
+    for top in range(0, fine.height, BAND_ROWS):  # bands fit the processor's caches
+        hits = scene.view(fine, view.enu_from_cam, pixels[top : top + BAND_ROWS])
+        bands.append(scene.colour(hits, footprint_m))
+    image = np.concatenate(bands).reshape(fine.height, fine.width, 3)
     image = cv2.resize(image, (view.camera.width, view.camera.height), interpolation=cv2.INTER_AREA)
     rng = np.random.default_rng(zlib.crc32(view.name.encode()))
     noise = SENSOR_NOISE * rng.standard_normal(image.shape, dtype=np.float32)
     return np.asarray(np.clip(image + noise + 0.5, 0, 255), np.uint8)
 
 
-def write_photograph(path: Path, rgb: UInt8, view: TrueView, ground_height_m: float) -> None:
-    """Write a JPEG with tags; `ground_height_m`: ellipsoidal height that relative altitudes count from."""
+def write_photograph(path: Path, rgb: UInt8, view: TrueView) -> None:
+    """Write a JPEG with the tags of a drone; relative altitudes count from the mean ground."""
     from PIL import Image
 
-    buffer = io.BytesIO()
-    Image.fromarray(rgb).save(
-        buffer, "JPEG", quality=92, exif=_exif(view), xmp=_xmp(view, ground_height_m).encode("utf-8")
-    )
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(buffer.getvalue())
-    part.replace(path)
-
-
-def photograph_survey_view(survey: Survey, view: TrueView, folder: Path) -> None:
-    """Render one view of a survey into a folder."""
-    write_photograph(folder / view.name, render(survey.scene, view), view, survey.origin.height_m)
+    packet = _xmp(view).encode("utf-8")
+    with replacing(path) as temporary:
+        Image.fromarray(rgb).save(temporary, "JPEG", quality=92, exif=_exif(view), xmp=packet)
 
 
 def _exif(view: TrueView) -> bytes:
@@ -81,16 +75,16 @@ def _degrees_minutes_seconds(angle_deg: float) -> tuple[float, float, float]:
     return degrees, minutes, round(seconds * 60.0, 7)
 
 
-def _xmp(view: TrueView, ground_height_m: float) -> str:
+def _xmp(view: TrueView) -> str:
     """Return the packet in the vocabulary that DJI drones write."""
-    fix: GpsFix = view.gps
+    fix = view.gps
     height_m = fix.height_m or 0.0
     tags = {
-        "AltitudeType": "RtkAlt",  # ellipsoidal
+        "AltitudeType": "RtkAlt" if fix.vertical == "ellipsoidal" else "GpsFusionAlt",
         "GpsLatitude": f"{fix.lat_deg:+.9f}",
         "GpsLongitude": f"{fix.lon_deg:+.9f}",
         "AbsoluteAltitude": f"{height_m:+.3f}",
-        "RelativeAltitude": f"{height_m - ground_height_m:+.3f}",
+        "RelativeAltitude": f"{view.enu_from_cam.translation[2]:+.3f}",
         "GimbalRollDegree": f"{view.attitude.roll_deg:+.2f}",
         "GimbalYawDegree": f"{view.attitude.yaw_deg:+.2f}",
         "GimbalPitchDegree": f"{view.attitude.pitch_deg:+.2f}",

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from ..geometry.arrays import Float, Int, UInt8
+from ..geometry.camera import Camera
+from ..geometry.transforms import Rigid3
 from .landscape import (
     BLOCK_SIZE_M,
     GROUND,
@@ -62,6 +64,16 @@ class Scene:
         return np.asarray(cross / np.linalg.norm(cross, axis=-1, keepdims=True))
 
     @cached_property
+    def _plane_offsets(self) -> Float:
+        """n . p (F,) of every triangle's plane."""
+        return np.asarray(np.einsum("fi,fi->f", self.normals, self.triangles[:, 0]))
+
+    @cached_property
+    def _light(self) -> Float:
+        """Brightness (F,) float32 of every triangle under the sun; shadows are not cast."""
+        return np.asarray(0.62 + 0.46 * np.clip(self.normals @ SUN, 0.0, None), np.float32)
+
+    @cached_property
     def _embree(self) -> Any:
         from embreex import rtcore_scene
         from embreex.mesh_construction import TriangleMesh
@@ -77,37 +89,46 @@ class Scene:
         precision; the distance is then computed in double precision on the triangle's plane.
         """
         directions = np.asarray(directions, float)
-        origins = np.broadcast_to(np.asarray(origins, float), directions.shape)
-        faces = self._embree.run(
-            np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions, np.float32)
-        )
-        faces = np.asarray(faces, np.int64)
+        origins = np.asarray(origins, float)
+        start = np.ascontiguousarray(np.broadcast_to(origins, directions.shape), np.float32)
+        faces = np.asarray(self._embree.run(start, np.ascontiguousarray(directions, np.float32)), np.int64)
         normals = self.normals[faces]
+        if origins.ndim == 1:
+            height = (self._plane_offsets - np.einsum("fi,i->f", self.normals, origins))[faces]
+        else:
+            height = self._plane_offsets[faces] - np.einsum("ni,ni->n", normals, origins)
         with np.errstate(divide="ignore", invalid="ignore"):
-            distances = np.einsum("ni,ni->n", self.triangles[faces, 0] - origins, normals)
-            distances = distances / np.einsum("ni,ni->n", directions, normals)
+            distances = height / np.einsum("ni,ni->n", directions, normals)
         missed = faces < 0
         distances[missed], normals[missed] = np.nan, np.nan
         return Hits(distances, origins + distances[:, None] * directions, normals, faces)
 
+    def view(self, camera: Camera, enu_from_cam: Rigid3, pixels: Float) -> Hits:
+        """Return what a camera sees at pixels (..., 2); as its rays have z = 1, the hit distance is the depth in m."""
+        rays = camera.rays(pixels).reshape(-1, 3)
+        # Not a matrix product: BLAS would start threads for three columns, and waiting for them costs more.
+        directions = np.einsum("ij,nj->ni", enu_from_cam.rotation, rays)
+        return self.cast(enu_from_cam.translation, directions)
+
     def colour(self, hits: Hits, footprint_m: float = 0.0) -> UInt8:
         """Return the colours (N, 3) 0..255 of hits; details smaller than `footprint_m` are left out; sky is blue."""
         faces = hits.faces
-        material = np.where(faces < 0, -1, self.material[faces])
+        material = self.material[faces]
+        material[faces < 0] = -1
         colour = np.full((len(faces), 3), SKY, np.float32)
         for kind in (GROUND, ROOF, WALL, TREE):
             chosen = np.flatnonzero(material == kind)
             if len(chosen):
                 a, b = self._texture_coordinates(kind, hits.points[chosen], faces[chosen])
-                colour[chosen] = self._paint(kind, a, b, self.base_colour[faces[chosen]], footprint_m)
-        light = 0.62 + 0.46 * np.clip(self.normals[faces] @ SUN, 0.0, None).astype(np.float32)
-        colour[faces >= 0] *= light[faces >= 0, None]
-        return np.clip(colour, 0.0, 255.0).astype(np.uint8)
+                base = self.base_colour[faces[chosen]] if kind != GROUND else None
+                paint = self._paint(kind, a, b, base, footprint_m)
+                colour[chosen] = paint * self._light[faces[chosen], None]
+        return np.clip(colour, 0.0, 255.0, out=colour).astype(np.uint8)
 
-    def _paint(self, kind: int, a: Float, b: Float, base: Float, footprint_m: float) -> Float:
-        """Return unlit colours (N, 3) of one material at texture coordinates a, b (N,)."""
+    def _paint(self, kind: int, a: Float, b: Float, base: Float | None, footprint_m: float) -> Float:
+        """Return unlit colours (N, 3) of one material at texture coordinates a, b (N,); the ground has no base."""
         detail = self.texture.detail(a, b, footprint_m)
-        if kind == GROUND:
+        if base is None:
             return self.texture.ground(a, b, detail)
         if kind == ROOF:
             return self.texture.roof(a, b, base, detail)

@@ -74,9 +74,10 @@ class Texture:
         total = np.zeros_like(a)
         for octave in range(DETAIL_OCTAVES):
             cell_m = FINEST_CELL_M * 2.0**octave
-            if cell_m < footprint_m:
+            visible = np.float32(min(1.0, 2.0 * cell_m / max(footprint_m, 1e-6) - 2.0))
+            if visible <= 0.0:
                 continue
-            value = self.noise(a, b, cell_m)
+            value = visible * self.noise(a, b, cell_m)
             if octave in (2, 4, 5):  # pebbles, tufts and bushes: dark and light blobs with an outline
                 total += 0.13 * (np.clip(4.0 * value - 4.0, 0.0, 1.0) - np.clip(-4.0 * value - 4.0, 0.0, 1.0))
             total += np.float32(0.055) * value
@@ -85,16 +86,19 @@ class Texture:
     def ground(self, a: Float, b: Float, detail: Float) -> Float:
         """Return colours (N, 3) float32 of fields, bare soil and roads."""
         patches = self.noise(a, b, 40.0, 1) + 0.5 * self.noise(a, b, 11.0, 2) + 2.0 * detail
-        meadow = np.clip(3.0 * patches + 0.5, 0.0, 1.0)[..., None]
-        soil = np.clip(5.0 * patches - 5.0, 0.0, 1.0)[..., None]
+        meadow = np.clip(3.0 * patches + 0.5, 0.0, 1.0)[:, None]
+        soil = np.clip(5.0 * patches - 5.0, 0.0, 1.0)[:, None]
         colour = GRASS + (MEADOW - GRASS) * meadow
         colour += (SOIL - colour) * soil
         for along, across in ((a, b), (b, a)):
             distance = self.distance_to_road(along, across)
+            near = np.flatnonzero(distance < ROAD_HALF_WIDTH_M + 0.5)
+            distance, way = distance[near, None], along[near, None]
             road = np.clip((ROAD_HALF_WIDTH_M - distance) / 0.15 + 0.5, 0.0, 1.0)
-            dash = np.clip((0.12 - distance) / 0.1 + 0.5, 0.0, 1.0) * (np.mod(along, 7.0) < 3.5)
-            colour += (ASPHALT - colour) * road[..., None] + np.float32(120.0) * dash[..., None]
-        return np.asarray(colour * (1.0 + detail)[..., None])
+            dash = np.clip((0.12 - distance) / 0.1 + 0.5, 0.0, 1.0) * (np.mod(way, 7.0) < 3.5)
+            colour[near] += (ASPHALT - colour[near]) * road + np.float32(120.0) * dash
+        colour *= 1.0 + detail[:, None]
+        return np.asarray(colour)
 
     @staticmethod
     def distance_to_road(along: Float, across: Float) -> Float:

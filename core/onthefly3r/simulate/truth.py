@@ -2,115 +2,71 @@
 
 from __future__ import annotations
 
-import io
 import json
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
-from ..geometry.arrays import Float, UInt8
-from .flight import Origin, Survey, TrueView, geodetic_from_enu
+from ..export.atomic import write_text
+from ..export.colmap import SparsePoints, write_model
+from ..export.las import write_cloud
+from ..geometry.arrays import Bool, Float, UInt8
+from ..geometry.geodesy import WorldFrame, utm_crs_for, wkt1
+from ..records import CloudTile, PlacedCamera
+from .flight import Survey, TrueView, tag_vertical
 
 CLOUD_POINTS = 300_000
-MODEL_POINTS = 2_000  # in points3D.txt, without tracks
+MODEL_POINTS = 2_000  # in points3D.txt
 MIN_VIEWS = 3  # the cloud is what so many photographs have in their frame
-LAS_SCALE_M = 0.001
 
 
 def write_truth(survey: Survey, folder: Path) -> None:
-    """Write cameras.txt, images.txt, points3D.txt (local ENU, m), origin.json and cloud.las (UTM) into a folder.
+    """Write cameras.txt, images.txt, points3D.txt (local ENU, m), origin.json and cloud.las into a folder.
 
-    origin.json names the WGS 84 position of the ENU origin, the UTM zone (EPSG) and the height reference.
+    The cloud is in the UTM zone of the origin, with heights as in the photographs' tags. origin.json names the
+    WGS 84 position of the ENU origin, that zone (`crs`) and the height reference of the cloud (`vertical`).
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    points, rgb = truth_cloud(survey)
-    utm_epsg = utm_zone_epsg(survey.origin)
-    _replace(folder / "cameras.txt", _cameras_text(survey.views).encode())
-    _replace(folder / "images.txt", _images_text(survey.views).encode())
-    _replace(folder / "points3D.txt", _points_text(points[:MODEL_POINTS], rgb[:MODEL_POINTS]).encode())
-    _replace(folder / "cloud.las", _las_bytes(projected_from_enu(points, survey.origin, utm_epsg), rgb, utm_epsg))
-    place = {**asdict(survey.origin), "epsg": utm_epsg, "vertical": "ellipsoidal", "frame": "east-north-up, m"}
-    _replace(folder / "origin.json", json.dumps(place, indent=2).encode())
+    world = truth_frame(survey)
+    points, rgb, in_frame = truth_cloud(survey)
+    views = in_frame.sum(axis=1)
+    some = slice(MODEL_POINTS)
+    point, image = np.nonzero(in_frame[some])
+    pixels = np.stack([_pixels(view, points[some]) for view in survey.views], axis=1)[point, image]
+    cameras = [
+        PlacedCamera(i, view.name, view.camera, view.enu_from_cam, batch=0) for i, view in enumerate(survey.views)
+    ]
+    sparse = SparsePoints(points[some], rgb[some], np.zeros(len(points[some])), point, image, pixels)
+    write_model(folder, cameras, sparse)
+    count = len(points)
+    tile = CloudTile(
+        world.from_enu(points), rgb, np.ones(count), source=np.full(count, -1), batch=np.zeros(count), views=views
+    )
+    write_cloud(folder / "cloud.las", iter([tile]), wkt1(world.crs, world.vertical), 0.001, "truth of a simulation")
+    place = {**asdict(survey.origin), "crs": world.crs, "vertical": world.vertical}
+    write_text(folder / "origin.json", json.dumps(place, indent=2) + "\n")
 
 
-def truth_cloud(survey: Survey, count: int = CLOUD_POINTS, seed: int = 0) -> tuple[Float, UInt8]:
-    """Return points (N, 3) ENU m under the open sky that at least three views have in their frame, and colours."""
+def truth_frame(survey: Survey) -> WorldFrame:
+    """Return the frame of the truth cloud: the origin's UTM zone, heights as in the photographs' tags."""
+    origin = survey.origin
+    return WorldFrame(utm_crs_for(origin.lat_deg, origin.lon_deg), tag_vertical(survey.options), origin)
+
+
+def truth_cloud(survey: Survey, count: int = CLOUD_POINTS, seed: int = 0) -> tuple[Float, UInt8, Bool]:
+    """Return points (N, 3) ENU m under the open sky, their colours (N, 3), and which views (N, V) frame them.
+
+    Only points that at least three views have in their frame; houses between are not looked for.
+    """
     hits = survey.scene.sample_surface(count, seed)
-    views = np.zeros(len(hits.points), np.int32)
-    for view in survey.views:
-        pixels = view.camera.project(view.enu_from_cam.inverse().apply(hits.points))
+    in_frame = np.zeros((len(hits.points), len(survey.views)), bool)
+    for index, view in enumerate(survey.views):
+        pixels = _pixels(view, hits.points)
         with np.errstate(invalid="ignore"):
-            views += np.all((pixels > 0.0) & (pixels < (view.camera.width, view.camera.height)), axis=-1)
-    seen = views >= min(MIN_VIEWS, len(survey.views))
-    return hits.points[seen], survey.scene.colour(hits)[seen]
+            in_frame[:, index] = np.all((pixels > 0.0) & (pixels < (view.camera.width, view.camera.height)), axis=-1)
+    seen = in_frame.sum(axis=1) >= MIN_VIEWS
+    return hits.points[seen], survey.scene.colour(hits)[seen], in_frame[seen]
 
 
-def utm_zone_epsg(origin: Origin) -> int:
-    """Return the EPSG code of the UTM zone (WGS 84) of the origin."""
-    zone = int((origin.lon_deg + 180.0) // 6.0) % 60 + 1
-    return (32600 if origin.lat_deg >= 0.0 else 32700) + zone
-
-
-def projected_from_enu(points: Float, origin: Origin, epsg: int) -> Float:
-    """Return easting, northing, ellipsoidal height (N, 3) of points (N, 3) in local ENU."""
-    import pyproj
-
-    lon, lat, height = geodetic_from_enu(points, origin).T
-    east, north = pyproj.Transformer.from_crs(4326, epsg, always_xy=True).transform(lon, lat)
-    return np.stack([east, north, height], axis=-1)
-
-
-def _cameras_text(views: Sequence[TrueView]) -> str:
-    """All views share one camera, number 1."""
-    c = views[0].camera
-    numbers = " ".join(repr(float(v)) for v in (c.fx, c.fy, c.cx, c.cy, *c.distortion))
-    return f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 OPENCV {c.width} {c.height} {numbers}\n"
-
-
-def _images_text(views: Sequence[TrueView]) -> str:
-    from scipy.spatial.transform import Rotation
-
-    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then POINTS2D[]"]
-    for number, view in enumerate(views, start=1):
-        cam_from_enu = view.enu_from_cam.inverse()
-        x, y, z, w = Rotation.from_matrix(cam_from_enu.rotation).as_quat()
-        pose = " ".join(repr(float(v)) for v in (w, x, y, z, *cam_from_enu.translation))
-        lines += [f"{number} {pose} 1 {view.name}", ""]
-    return "\n".join(lines) + "\n"
-
-
-def _points_text(points: Float, rgb: UInt8) -> str:
-    lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
-    for number, ((x, y, z), (r, g, b)) in enumerate(zip(points, rgb, strict=True), start=1):
-        lines.append(f"{number} {x:.4f} {y:.4f} {z:.4f} {r} {g} {b} 0")
-    return "\n".join(lines) + "\n"
-
-
-def _las_bytes(points: Float, rgb: UInt8, utm_epsg: int) -> bytes:
-    """Return a LAS 1.4 file, point format 7, with the compound CRS UTM + ellipsoidal height as WKT 1."""
-    import laspy
-    import pyproj
-    from laspy.vlrs.known import WktCoordinateSystemVlr
-
-    horizontal = pyproj.CRS.from_epsg(utm_epsg).to_wkt("WKT1_GDAL")
-    vertical = 'VERT_CS["Ellipsoid (metre)",VERT_DATUM["Ellipsoid",2002],UNIT["metre",1],AXIS["Up",UP]]'
-    header = laspy.LasHeader(version="1.4", point_format=7)
-    header.vlrs.append(WktCoordinateSystemVlr(f'COMPD_CS["UTM + ellipsoidal height",{horizontal},{vertical}]'))
-    header.global_encoding.wkt = True
-    header.scales = np.full(3, LAS_SCALE_M)
-    header.offsets = np.round(points.mean(axis=0))
-    cloud = laspy.LasData(header)
-    cloud.x, cloud.y, cloud.z = points.T
-    cloud.red, cloud.green, cloud.blue = rgb.T.astype(np.uint16) * 257
-    cloud.return_number = cloud.number_of_returns = np.ones(len(points), np.uint8)
-    buffer = io.BytesIO()
-    cloud.write(buffer)
-    return buffer.getvalue()
-
-
-def _replace(path: Path, content: bytes) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(content)
-    part.replace(path)
+def _pixels(view: TrueView, points: Float) -> Float:
+    return view.camera.project(view.enu_from_cam.inverse().apply(points))
