@@ -89,14 +89,11 @@ class Scene:
         precision; the distance is then computed in double precision on the triangle's plane.
         """
         directions = np.asarray(directions, float)
-        origins = np.asarray(origins, float)
-        start = np.ascontiguousarray(np.broadcast_to(origins, directions.shape), np.float32)
-        faces = np.asarray(self._embree.run(start, np.ascontiguousarray(directions, np.float32)), np.int64)
+        origins = np.broadcast_to(np.asarray(origins, float), directions.shape)
+        start, towards = (np.ascontiguousarray(a, np.float32) for a in (origins, directions))
+        faces = np.asarray(self._embree.run(start, towards), np.int64)
         normals = self.normals[faces]
-        if origins.ndim == 1:
-            height = (self._plane_offsets - np.einsum("fi,i->f", self.normals, origins))[faces]
-        else:
-            height = self._plane_offsets[faces] - np.einsum("ni,ni->n", normals, origins)
+        height = self._plane_offsets[faces] - np.einsum("ni,ni->n", normals, origins)
         with np.errstate(divide="ignore", invalid="ignore"):
             distances = height / np.einsum("ni,ni->n", directions, normals)
         missed = faces < 0
