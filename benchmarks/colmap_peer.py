@@ -141,7 +141,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     head = "| set | photographs | ours s/image | pycolmap s/image | times faster | coverage | ATE % | ARE deg | MiB |"
     lines = [head, "|---|---|---|---|---|---|---|---|---|"]
     for row in rows:
-        figures = row.get("evaluation") or {}
+        figures = (row.get("evaluation") or {}).get("poses") or {}
         cells = [
             row["set"],
             str(row["photographs"]),
@@ -149,7 +149,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             shown(row.get("peer", {}).get("s_per_image")),
             shown(row.get("times_faster")),
             shown(figures.get("coverage"), 3),
-            shown(figures.get("ate_percent"), 3),
+            shown(figures.get("ate_percent_of_depth"), 3),
             shown(figures.get("are_deg"), 3),
             shown(row["ours"].get("memory_mib"), 0),
         ]

@@ -343,3 +343,30 @@ def test_warnings_of_the_report_are_told_once(
     events = [Event.from_line(line) for line in shown.stdout.splitlines()]
     warnings = [event.data["message"] for event in events if event.kind == "warning"]
     assert warnings == ["heights drift", "3 photographs without a position"]
+
+
+def test_evaluate_tells_how_far_apart_two_trajectories_are(tmp_path: Path) -> None:
+    header = "image,x,y,z,omega,phi,kappa,status"
+    rows = [(f"{number}.jpg", 10.0 * number, float(number**2), 5.0 * (number % 3)) for number in range(9)]
+    for name, shift in (("ours.csv", 0.0), ("reference.csv", 0.3)):
+        lines = [f"{image},{x},{y + shift * (-1) ** k},{z},0,0,0,placed" for k, (image, x, y, z) in enumerate(rows)]
+        (tmp_path / name).write_text("\n".join([header, *lines]) + "\n", encoding="utf-8")
+    files = (tmp_path / "ours.csv", "--reference-poses", tmp_path / "reference.csv", "--align", "none")
+    told = json.loads(call("evaluate", *files, "--json").stdout)
+    assert told["kind"] == "result"
+    assert told["poses"]["ate"] == pytest.approx(0.3)
+    assert told["poses"]["coverage"] == 1.0
+    assert "ATE" in call("evaluate", *files).stdout
+    assert call("evaluate", tmp_path / "ours.csv").exit_code == 2
+    assert call("evaluate", *files, "--align", "affine").exit_code == 2
+
+
+def test_simulate_renders_what_was_asked_for(tmp_path: Path) -> None:
+    out = tmp_path / "survey"
+    sizes = ("--images", 4, "--strips", 2, "--image-width-px", 240, "--image-height-px", 200)
+    shown = call("simulate", out, *sizes, "--json")
+    assert shown.exit_code == 0, shown.output
+    assert Event.from_line(shown.stdout.splitlines()[-1]).data["given"] == 4
+    assert len(list((out / "photos").iterdir())) == 4
+    assert (out / "truth" / "images.txt").is_file()
+    assert call("simulate", tmp_path / "none", "--images", 1).exit_code == 2

@@ -13,8 +13,10 @@ import typer
 
 from . import __version__
 from .command_options import given, run_options, with_options_of, with_run_options
-from .console import session, use_utf8
+from .console import columns, session, use_utf8
 from .errors import InputError
+from .evaluate.run import CloudAlign
+from .evaluate.trajectory import Align
 from .options import check
 from .simulate.flight import SurveyOptions
 
@@ -68,7 +70,7 @@ def run(
         result = reconstruct(photos, out, options, here.progress, here.cancelled)
         for warning in result.report.get("warnings", ()):
             here.warning(warning)
-        here.reporter.result(_result_data(result), _result_summary(result))
+        here.reporter.result(_result_data(result), columns(_result_summary(result)))
 
 
 @app.command()
@@ -86,7 +88,56 @@ def export(
         from .engine import export_again
 
         again = export_again(result, out, options, here.progress)
-        here.reporter.result(_result_data(again), _result_summary(again))
+        here.reporter.result(_result_data(again), columns(_result_summary(again)))
+
+
+@app.command()
+def evaluate(
+    result: Annotated[
+        Path, typer.Argument(metavar="RESULT", help="output folder of a run, or a file of poses or points")
+    ],
+    reference_poses: Annotated[
+        Path | None,
+        typer.Option(help="COLMAP text model, trajectory table (CSV), TUM file, or output folder", metavar="path"),
+    ] = None,
+    reference_cloud: Annotated[
+        Path | None, typer.Option(help="LAS, LAZ or PLY cloud, or output folder", metavar="path")
+    ] = None,
+    align: Annotated[
+        Align,
+        typer.Option(help="fitted to the camera centres before poses are compared: sim3, se3 or none", metavar="word"),
+    ] = "sim3",
+    cloud_align: Annotated[
+        CloudAlign,
+        typer.Option(
+            help="none compares clouds as they lie, poses moves the result by the cameras' fit", metavar="word"
+        ),
+    ] = "none",
+    common_with: Annotated[
+        list[Path] | None,
+        typer.Option(help="further results: adds the errors over the images that all hold", metavar="path"),
+    ] = None,
+    icp: Annotated[bool, typer.Option("--icp", help="refine the clouds' alignment (needs the extra cloud)")] = False,
+    ground_cell_m: Annotated[
+        float | None, typer.Option(help="also compare heights over a grid of this cell", metavar="m", min=0.001)
+    ] = None,
+    json: JsonLines = False,
+) -> None:
+    """Compare a result with reference poses, a reference cloud, or both."""
+    with session(json_lines=json, polite=False) as here:
+        from .evaluate.run import evaluate, format_table
+
+        report = evaluate(
+            result,
+            reference_poses,
+            reference_cloud,
+            align=align,
+            common_with=common_with or (),
+            cloud_align=cloud_align,
+            icp=icp,
+            ground_cell_m=ground_cell_m,
+        )
+        here.reporter.result(report.to_dict(), format_table(report))
 
 
 @app.command()
@@ -100,7 +151,7 @@ def simulate(out: Out, json: JsonLines = False, **values: Any) -> None:
 
         survey = simulate_survey(out, options, here.progress)
         data = {"photos": str(out / "photos"), "truth": str(out / "truth"), "given": len(survey.views)}
-        here.reporter.result(data, {name: str(value) for name, value in data.items()})
+        here.reporter.result(data, columns({name: str(value) for name, value in data.items()}))
 
 
 @app.command()
@@ -115,7 +166,7 @@ def demo(
         shown = run_demo(out, here.progress, here.cancelled)
         here.reporter.result(
             {**_result_data(shown.result), "accuracy": asdict(shown.accuracy)},
-            {**_result_summary(shown.result), **_demo_summary(shown)},
+            columns({**_result_summary(shown.result), **_demo_summary(shown)}),
         )
 
 

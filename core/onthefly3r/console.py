@@ -27,7 +27,7 @@ _DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.ER
 
 
 class HumanReporter:
-    """A progress bar on standard error and the result as a table on standard output."""
+    """A progress bar on standard error and the result as text on standard output."""
 
     def __init__(self) -> None:
         self.errors = Console(stderr=True, highlight=False)
@@ -78,12 +78,10 @@ class HumanReporter:
         colour = "yellow" if exit_code == Cancelled.exit_code else "red"
         self.errors.print(message, style=colour, markup=False, soft_wrap=True)
 
-    def result(self, data: dict[str, Any], summary: dict[str, str]) -> None:
-        """Print the summary in two columns; a path is never broken."""
+    def result(self, data: dict[str, Any], text: str) -> None:
+        """Print the result; lines are not broken, so that a path stays whole."""
         self._bar.stop()
-        width = max(map(len, summary), default=0)
-        for name, value in summary.items():
-            print(f"{name:<{width}}  {value}")
+        print(text)
 
 
 class JsonReporter:
@@ -124,7 +122,7 @@ class JsonReporter:
         """Write the event that says why the command ends."""
         self._emit(protocol.Event("error", {"message": message, "exit_code": exit_code}))
 
-    def result(self, data: dict[str, Any], summary: dict[str, str]) -> None:
+    def result(self, data: dict[str, Any], text: str) -> None:
         """Write the result event."""
         self._emit(protocol.Event("result", data))
 
@@ -241,6 +239,12 @@ def use_utf8() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(encoding="utf-8", errors="replace")
+
+
+def columns(facts: dict[str, str]) -> str:
+    """Return names and values as text in two columns."""
+    width = max(map(len, facts), default=0)
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in facts.items())
 
 
 def _clock(seconds: float) -> str:
