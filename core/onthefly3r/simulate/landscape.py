@@ -11,6 +11,7 @@ from .texture import ROAD_HALF_WIDTH_M, Texture
 
 GROUND, ROOF, WALL, TREE = 0, 1, 2, 3
 BLOCK_SIZE_M = 60.0
+HOUSE_REACH_M = 12.0  # from the middle of the largest house to its corners
 MAX_OBJECTS = 4000  # of each kind, whatever the extent
 ROOF_COLOURS = ((168, 86, 66), (126, 64, 56), (110, 112, 120), (150, 138, 124), (92, 84, 82), (176, 170, 164))
 WALL_COLOURS = ((206, 200, 186), (188, 168, 140), (170, 172, 176))
@@ -125,15 +126,19 @@ def scatter_objects(
     blocks (B, 2): the blocks' south-west corners, ENU m; nothing else stands in them.
     """
     patches: list[Patch] = []
+    houses = [np.full(2, np.inf)]
     for x, y in _jittered_grid(bounds, building_spacing_m, rng):
         size = np.array([rng.uniform(9.0, 20.0), rng.uniform(8.0, 13.0), rng.uniform(3.0, 9.0)])
         yaw, look = rng.uniform(0.0, np.pi), int(rng.integers(1_000))
         gable_m = rng.uniform(1.5, 3.5) if rng.random() < 0.6 else 0.0
         if rng.random() < 0.75 and _is_free(x, y, 10.0 + ROAD_HALF_WIDTH_M, blocks):
             patches += building(np.array([x, y]), size, yaw, float(hills.height(x, y)), gable_m, look)
+            houses.append(np.array([x, y]))
+    centres = np.array(houses)
     for x, y in _jittered_grid(bounds, tree_spacing_m, rng):
         radius_m = rng.uniform(1.2, 3.2)
-        if rng.random() < 0.6 and _is_free(x, y, radius_m + ROAD_HALF_WIDTH_M, blocks):
+        apart = np.linalg.norm(centres - (x, y), axis=-1).min() > HOUSE_REACH_M + radius_m
+        if apart and rng.random() < 0.6 and _is_free(x, y, radius_m + ROAD_HALF_WIDTH_M, blocks):
             patches.append(tree(np.array([x, y]), radius_m, float(hills.height(x, y)), rng))
     for corner_x, corner_y in blocks:
         for column, row in ((0.2, 0.2), (0.7, 0.2), (0.2, 0.7), (0.7, 0.75)):

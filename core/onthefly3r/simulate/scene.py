@@ -5,6 +5,7 @@ Everything is in a local east-north-up frame in metres about the survey's origin
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -21,6 +22,7 @@ from .landscape import (
     TREE,
     WALL,
     Hills,
+    Patch,
     ground_patch,
     place_blocks,
     scatter_objects,
@@ -208,19 +210,29 @@ def make_scene(
     ground = ground_patch(hills, bounds, cell_m=max(2.0, extent_m / 600.0))
     patches = [ground, *scatter_objects(hills, bounds, blocks, building_spacing_m, tree_spacing_m, rng)]
 
-    def per_triangle(values: list[Any], dtype: type) -> Any:
-        return np.concatenate(
-            [np.repeat(np.asarray(v, dtype)[None], len(p.triangles), 0) for p, v in zip(patches, values, strict=True)]
-        )
+    return assemble_scene(patches, hills, bounds, seed, blocks)
+
+
+def assemble_scene(
+    patches: Sequence[Patch],
+    hills: Hills,
+    bounds: tuple[float, float, float, float],
+    seed: int,
+    blocks: Float | None = None,
+) -> Scene:
+    """Return the scene that consists of the given patches; the seed draws its texture."""
+
+    def per_triangle(value: Callable[[Patch], Any], dtype: type) -> Any:
+        return np.concatenate([np.repeat(np.asarray(value(p), dtype)[None], len(p.triangles), axis=0) for p in patches])
 
     return Scene(
         triangles=np.concatenate([p.triangles for p in patches]),
-        material=per_triangle([p.material for p in patches], np.int8),
-        base_colour=per_triangle([p.colour for p in patches], np.float32),
-        texture_axes=per_triangle([np.stack([p.axis_u, p.axis_v]) for p in patches], np.float32),
-        texture_offset=per_triangle([p.offset for p in patches], np.float32),
+        material=per_triangle(lambda p: p.material, np.int8),
+        base_colour=per_triangle(lambda p: p.colour, np.float32),
+        texture_axes=per_triangle(lambda p: np.stack([p.axis_u, p.axis_v]), np.float32),
+        texture_offset=per_triangle(lambda p: p.offset, np.float32),
         hills=hills,
-        blocks=blocks,
+        blocks=np.zeros((0, 2)) if blocks is None else blocks,
         texture=Texture(seed),
         bounds=bounds,
     )
