@@ -16,13 +16,14 @@ from ..geometry.arrays import Bool, Float
 from ..geometry.transforms import Sim3, nearest_rotation, rotation_exp, skew
 from ..geometry.umeyama import weighted_similarity
 from .positions import Positions
-from .updirection import UpWitness, cauchy_weight, squared_misfit
+from .updirection import UpWitness, cauchy_cost, cauchy_weight, squared_misfit
 
 SAMPLES = 600  # of RANSAC; with half the positions wrong, 600 pairs hold about 150 good ones
 TUKEY = 4.685  # 95 % efficient
 OUTLIER_SIGMAS = 4.0
 MIN_NOISE = 0.1  # of the stated sigmas: consumer receivers stated at 3 m repeat to 0.3 m at best
 MAX_CORRELATION = 0.98
+TREND_CORE = 4.0  # squared sigmas beyond which height drift is an accident and no longer noise
 
 
 @dataclass(frozen=True)
@@ -221,7 +222,7 @@ class _Solver:
         hessian = np.einsum("nkp,nk,nkq->pq", jacobian, weight, jacobian)
         gradient = np.einsum("nkp,nk,nk->p", jacobian, weight, residuals)
         sigma = self._trend_sigma()
-        trend_weight = cauchy_weight(float(self.trend @ self.trend) / sigma**2) / sigma**2
+        trend_weight = cauchy_weight(float(self.trend @ self.trend) / sigma**2, TREND_CORE) / sigma**2
         hessian[[7, 8], [7, 8]] += trend_weight
         gradient[7:9] -= trend_weight * self.trend
         bias_weight = 1.0 / max(float(np.median(p.sigma_v_m)), 1e-3) ** 2 if self.flights > 1 else 1e12
@@ -263,9 +264,8 @@ class _Solver:
         horizontal = _tukey_cost(np.hypot(residuals[:, 0], residuals[:, 1]) / (noise[0] * p.sigma_h_m))
         vertical = _tukey_cost(residuals[:, 2] / (noise[1] * p.sigma_v_m)) * p.has_height
         cost = noise[2] * float(horizontal.sum() + vertical.sum())
-        squares = [squared_misfit(witness, self.transform.rotation[2]) for witness in self.witnesses]
-        squares.append(float(self.trend @ self.trend) / self._trend_sigma() ** 2)
-        return cost + 2.0 * float(np.log1p(0.25 * np.array(squares)).sum())
+        cost += sum(cauchy_cost(squared_misfit(witness, self.transform.rotation[2])) for witness in self.witnesses)
+        return cost + cauchy_cost(float(self.trend @ self.trend) / self._trend_sigma() ** 2, TREND_CORE)
 
     def _who_decided(self) -> tuple[Float, tuple[tuple[str, float], ...]]:
         """Return the tilt sigmas of positions alone, and each source's share of the tilt information."""

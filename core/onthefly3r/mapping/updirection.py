@@ -20,6 +20,7 @@ GIMBAL_SIGMA_DEG = 1.5  # offset of a flight's gimbal; single frames scatter les
 GROUND_SIGMA_DEG = 5.0  # natural slope of the ground under a survey
 LEVEL_SIGMA_DEG = 4.0  # the image's horizontal edge against the horizon
 NADIR_SIGMA_DEG = 10.0  # mean viewing direction against straight down
+WITNESS_CORE = 4.0  # squared sigmas beyond which a witness counts as mistaken
 MAX_AXIS_SPREAD_DEG = 40.0  # beyond this viewing directions tell nothing about nadir
 
 
@@ -76,9 +77,14 @@ def squared_misfit(witness: UpWitness, up: Float) -> float:
     return float((((witness.directions @ up) / witness.sigma) ** 2).sum())
 
 
-def cauchy_weight(squared: float) -> float:
-    """Return the IRLS weight of the Cauchy cost log(1 + squared / 4) * 2."""
-    return 1.0 / (1.0 + 0.25 * squared)
+def cauchy_weight(squared: float, core: float = WITNESS_CORE) -> float:
+    """Return the IRLS weight of `cauchy_cost`."""
+    return 1.0 / (1.0 + squared / core)
+
+
+def cauchy_cost(squared: float, core: float = WITNESS_CORE) -> float:
+    """Return the heavy-tailed cost that starts as half the squared misfit."""
+    return 0.5 * core * float(np.log1p(squared / core))
 
 
 def _gimbal_up(
