@@ -224,11 +224,13 @@ def reconstruct(photos, out, options, progress, cancel):
     from onthefly3r.protocol import Progress
     import os
     os.write(1, b"native chatter\\n")
-    for step in range(600):
-        progress(Progress("mapping", step, 600))
-        if cancel():
-            raise Cancelled("stopped on request")
-        time.sleep(0.05)
+    try:
+        for step in range(600):
+            progress(Progress("mapping", step, 600))
+            time.sleep(0.05)
+    except Cancelled:
+        os.write(2, b"the engine tidied up\\n")
+        raise
 engine.reconstruct = reconstruct
 sys.modules["onthefly3r.engine"] = engine
 from onthefly3r.cli import main
@@ -256,6 +258,7 @@ def test_signal_stops_a_real_process_cleanly(number: signal.Signals, tmp_path: P
     assert {event.kind for event in events} == {"progress", "error"}
     assert events[-1].data["exit_code"] == 130
     assert "native chatter" in errors
+    assert "the engine tidied up" in errors
     assert "Traceback" not in errors
 
 
