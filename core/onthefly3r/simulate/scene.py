@@ -30,7 +30,9 @@ from .landscape import (
 from .texture import Texture
 
 SUN = np.array([0.45, -0.35, 0.82]) / np.linalg.norm([0.45, -0.35, 0.82])
-NEAREST_TRIANGLES = 24  # candidates of an exact point-to-triangle distance
+GRAZING = 1e-4  # disagreement of the two precisions, relative, that tells a ray along the plane
+NEAREST_TRIANGLES = 12  # candidates of an exact point-to-triangle distance
+QUERY_EDGE_M = 3.0  # longest edge of those triangles
 QUERY_CHUNK = 20_000
 SKY = (150.0, 180.0, 215.0)
 
@@ -88,16 +90,19 @@ class Scene:
         """Return the first hit of each ray.
 
         origins (3,) or (N, 3) ENU m, directions (N, 3) of any length. Embree finds the triangle in single
-        precision; the distance is then computed in double precision on the triangle's plane.
+        precision; the distance is then computed in double precision on the triangle's plane, except where the ray
+        runs along the plane.
         """
         directions = np.asarray(directions, float)
         origins = np.broadcast_to(np.asarray(origins, float), directions.shape)
         start, towards = (np.ascontiguousarray(a, np.float32) for a in (origins, directions))
-        faces = np.asarray(self._embree.run(start, towards), np.int64)
+        found = self._embree.run(start, towards, output=1)
+        faces, rough = np.asarray(found["primID"], np.int64), np.asarray(found["tfar"], float)
         normals = self.normals[faces]
         height = self._plane_offsets[faces] - np.einsum("ni,ni->n", normals, origins)
         with np.errstate(divide="ignore", invalid="ignore"):
             distances = height / np.einsum("ni,ni->n", directions, normals)
+            distances = np.where(np.abs(distances - rough) < GRAZING * rough, distances, rough)
         missed = faces < 0
         distances[missed], normals[missed] = np.nan, np.nan
         return Hits(distances, origins + distances[:, None] * directions, normals, faces)
@@ -161,35 +166,35 @@ class Scene:
         return Hits(np.zeros(len(faces)), points, self.normals[faces], faces)
 
     @cached_property
-    def _triangle_index(self) -> tuple[Float, Any]:
-        """Triangles of similar size and a tree of their centres."""
+    def _triangle_indices(self) -> list[tuple[Float, Any]]:
+        """Triangles of similar size with a tree of their centres, for each of ground, houses and crowns."""
         import trimesh
         from scipy.spatial import cKDTree
 
-        ground = self.triangles[self.material == GROUND]
-        size = float(np.linalg.norm(ground[0, 1] - ground[0, 0]))
-        objects = self.triangles[self.material != GROUND]
-        if len(objects):
-            vertices, faces = trimesh.remesh.subdivide_to_size(
-                objects.reshape(-1, 3), np.arange(3 * len(objects)).reshape(-1, 3), max_edge=1.5 * size
-            )
-            ground = np.concatenate([ground, np.asarray(vertices)[faces]])
-        return ground, cKDTree(ground.mean(axis=1))
+        indices = []
+        for kinds in ((GROUND,), (ROOF, WALL), (TREE,)):
+            triangles = self.triangles[np.isin(self.material, kinds)]
+            if len(triangles):
+                corners = np.arange(3 * len(triangles)).reshape(-1, 3)
+                vertices, faces = trimesh.remesh.subdivide_to_size(triangles.reshape(-1, 3), corners, QUERY_EDGE_M)
+                triangles = np.asarray(vertices)[faces]
+                indices.append((triangles, cKDTree(triangles.mean(axis=1))))
+        return indices
 
     def distance_to_surface(self, points: Float) -> Float:
         """Return the distance (N,) in metres of points (N, 3) to the nearest point of the surface."""
         import trimesh
 
-        triangles, tree = self._triangle_index
         points = np.asarray(points, float)
-        distances = np.empty(len(points))
-        for start in range(0, len(points), QUERY_CHUNK):
-            chunk = points[start : start + QUERY_CHUNK]
-            _, nearest = tree.query(chunk, k=min(NEAREST_TRIANGLES, len(triangles)))
-            count = nearest.shape[1]
-            closest = trimesh.triangles.closest_point(triangles[nearest.ravel()], np.repeat(chunk, count, axis=0))
-            offset = np.asarray(closest).reshape(-1, count, 3) - chunk[:, None]
-            distances[start : start + QUERY_CHUNK] = np.linalg.norm(offset, axis=-1).min(axis=1)
+        distances = np.full(len(points), np.inf)
+        for triangles, tree in self._triangle_indices:
+            for start in range(0, len(points), QUERY_CHUNK):
+                chunk = slice(start, start + QUERY_CHUNK)
+                _, nearest = tree.query(points[chunk], k=min(NEAREST_TRIANGLES, len(triangles)))
+                repeated = np.repeat(points[chunk], nearest.shape[1], axis=0)
+                closest = trimesh.triangles.closest_point(triangles[nearest.ravel()], repeated)
+                offset = np.linalg.norm(np.asarray(closest) - repeated, axis=-1).reshape(nearest.shape)
+                distances[chunk] = np.minimum(distances[chunk], offset.min(axis=1))
         return distances
 
 
