@@ -13,7 +13,7 @@ from ..geometry.transforms import Sim3
 from .clouds import CloudFile
 from .surface import sample
 
-SYSTEM_LIBRARIES = "apt-get install libegl1 libgl1 libgomp1 libx11-6 libusb-1.0-0 libudev1 libidn2-0"
+SYSTEM_LIBRARIES = "apt-get install libegl1 libgl1 libx11-6 libusb-1.0-0 libudev1 libidn2-0"
 MAX_POINTS = 200_000
 REACHES = (50.0, 15.0, 5.0)  # how far apart partners may be, in point spacings of the reference, from coarse to fine
 MAX_ITERATIONS = 60
