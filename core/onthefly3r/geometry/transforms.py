@@ -37,7 +37,7 @@ def rotation_log(rotation: Float) -> Float:
     column = int(np.argmax(np.diag(rotation)))
     axis = rotation[:, column] + np.eye(3)[column]
     axis = axis / np.linalg.norm(axis)
-    return axis * angle * (1.0 if float(vee @ axis) >= 0.0 else -1.0)
+    return np.asarray(axis * angle * (1.0 if float(vee @ axis) >= 0.0 else -1.0))
 
 
 def rotation_angle_deg(rotation: Float) -> float:
