@@ -8,20 +8,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from onthefly3r.export.las import write_cloud
+from onthefly3r.export.las import CloudSummary, write_cloud
 from onthefly3r.export.preview import PLACED, REJECTED, round_length, write_preview
 from onthefly3r.export.rows import CameraRow
-from onthefly3r.export.topview import TopView, Window, central_window
+from onthefly3r.export.topview import TopView, Window
 from onthefly3r.records import CloudTile
 
 ORIGIN = np.array([576_700.0, 5_188_100.0, 160.0])
 
 
-def write(path: Path, points: np.ndarray, rgb: np.ndarray) -> Path:
+def write(path: Path, points: np.ndarray, rgb: np.ndarray) -> CloudSummary:
     zeros = np.zeros(len(points), np.int32)
     tile = CloudTile(points, rgb.astype(np.uint8), np.ones(len(points), np.float32), zeros, zeros, zeros + 1)
-    write_cloud(path, iter([tile]), None, 0.001)
-    return path
+    return write_cloud(path, iter([tile]), None, 0.001)
 
 
 def ground(rng: np.random.Generator, n: int = 60_000) -> np.ndarray:
@@ -67,8 +66,8 @@ def test_gaps_are_closed_and_outlines_stay() -> None:
 
 def test_stray_points_do_not_widen_the_window(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    points = np.concatenate([ground(rng), ORIGIN + rng.normal(0, 5_000, (20, 3))])
-    window = central_window(write(tmp_path / "c.laz", points, np.full((len(points), 3), 90)))
+    points = rng.permutation(np.concatenate([ground(rng), ORIGIN + rng.normal(0, 5_000, (60, 3))]))
+    window = Window(*write(tmp_path / "c.laz", points, np.full((len(points), 3), 90)).window)
     assert window.width == pytest.approx(80, abs=2)
     assert window.height == pytest.approx(40, abs=2)
 
@@ -91,7 +90,7 @@ def test_picture_shows_cloud_and_cameras_where_they_are(tmp_path: Path, suffix: 
     rows = [CameraRow(f"{k}", "placed", x=ORIGIN[0] + 10 + 12 * k, y=ORIGIN[1] + 20, z=200.0) for k in range(6)]
     rows.append(CameraRow("x", "rejected", gps_x=ORIGIN[0] + 70, gps_y=ORIGIN[1] + 35))
     rows.append(CameraRow("nowhere", "rejected"))
-    write_preview(tmp_path / "preview.png", cloud, rows, "A survey", 0.2, georeferenced=True)
+    write_preview(tmp_path / "preview.png", cloud, rows, "A survey", georeferenced=True)
 
     with Image.open(tmp_path / "preview.png") as picture:
         image = np.asarray(picture)
@@ -113,6 +112,6 @@ def test_picture_shows_cloud_and_cameras_where_they_are(tmp_path: Path, suffix: 
 def test_one_camera_and_a_tiny_cloud(tmp_path: Path) -> None:
     cloud = write(tmp_path / "c.laz", ORIGIN + np.zeros((1, 3)), np.full((1, 3), 90))
     rows = [CameraRow("a", "placed", x=ORIGIN[0], y=ORIGIN[1], z=5.0)]
-    write_preview(tmp_path / "preview.png", cloud, rows, "", float("nan"), georeferenced=False)
+    write_preview(tmp_path / "preview.png", cloud, rows, "", georeferenced=False)
     with Image.open(tmp_path / "preview.png") as picture:
         assert picture.size[0] >= 640

@@ -26,7 +26,7 @@ GEO = GeoReference(
     float("nan"),
     warnings=("tilt",),
 )
-CLOUD = CloudSummary(Path("/out/cloud.laz"), 12, (0.0, 1.0, 2.0, 3.0, 4.0, 5.0), 0.05)
+CLOUD = CloudSummary(Path("/out/cloud.laz"), 12, (0.0, 1.0, 2.0, 3.0, 4.0, 5.0), (0.0, 1.0, 3.0, 4.0), 0.05)
 
 
 def summary() -> RunSummary:

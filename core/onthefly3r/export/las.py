@@ -22,13 +22,18 @@ MAX_POINT_SOURCE = 65_535  # 16 bit; 0 is reserved for the writing software (LAS
 INT32_RANGE = 2**31 - 1
 
 
+WINDOW_STRIDE = 100  # every so many points are looked at for the window
+WINDOW_TAIL = 0.005  # share of the points outside the window on each side
+
+
 @dataclass(frozen=True)
 class CloudSummary:
-    """What was written: bounds are (min x, min y, min z, max x, max y, max z) in the CRS of the file."""
+    """What was written, in the CRS of the file, m."""
 
     path: Path
     points: int
-    bounds: tuple[float, float, float, float, float, float]
+    bounds: tuple[float, float, float, float, float, float]  # min x, min y, min z, max x, max y, max z
+    window: tuple[float, float, float, float]  # min x, min y, max x, max y without the outermost points
     mean_spacing_m: float
 
 
@@ -74,23 +79,27 @@ def write_cloud(
     wide = n_images > MAX_POINT_SOURCE
     header = _header(np.round(first.points.mean(axis=0)), scale_m, wkt1 or LOCAL_WKT1, description, wide)
     spacing, count = 0.0, 0
+    sample: list[Float] = []
     compress = path.suffix.lower() == ".laz"
     with replacing(path) as temporary:
         with laspy.open(temporary, mode="w", header=header, do_compress=compress) as writer:
             tile: CloudTile | None = first
             while tile is not None:
                 writer.write_points(_record(tile, header, wide))
+                sample.append(tile.points[::WINDOW_STRIDE, :2])
                 tile_spacing = point_spacing(tile.points)
                 if np.isfinite(tile_spacing):
                     spacing, count = spacing + tile_spacing * len(tile.points), count + len(tile.points)
                 tile = next(tiles, None)
             written = writer.header
         path.with_name(f"{path.stem}.copc.laz").unlink(missing_ok=True)
-    bounds = tuple(float(b) for b in (*written.mins, *written.maxs))
+    low, high = np.quantile(np.concatenate(sample), [WINDOW_TAIL, 1.0 - WINDOW_TAIL], axis=0)
+    (min_x, min_y, min_z), (max_x, max_y, max_z) = (map(float, ends) for ends in (written.mins, written.maxs))
     return CloudSummary(
         path=path,
         points=int(written.point_count),
-        bounds=(bounds[0], bounds[1], bounds[2], bounds[3], bounds[4], bounds[5]),
+        bounds=(min_x, min_y, min_z, max_x, max_y, max_z),
+        window=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
         mean_spacing_m=spacing / count if count else float("nan"),
     )
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from ..geometry.arrays import Float
 from .atomic import replacing
+from .las import CloudSummary
 from .rows import CameraRow
-from .topview import TopView, Window, central_window, read_points
+from .topview import TopView, Window, read_points
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
@@ -29,27 +30,27 @@ PLACED = (45, 212, 235)
 REJECTED = (255, 82, 82)
 
 
-def write_preview(
-    path: Path, cloud: Path, rows: Sequence[CameraRow], title: str, mean_spacing_m: float, georeferenced: bool
-) -> None:
-    """Write a PNG about 1600 px wide of the LAS or LAZ file `cloud`.
+def write_preview(path: Path, cloud: CloudSummary, rows: Sequence[CameraRow], title: str, georeferenced: bool) -> None:
+    """Write a PNG about 1600 px wide of a cloud that was written.
 
-    Placed cameras are dots joined in capture order, rejected ones crosses at their tagged position.
+    Placed cameras are dots joined in capture order, rejected ones crosses at their tagged position. Points far outside
+    the bulk of the cloud may lie outside the picture.
 
     Args:
         path: final name, ending in .png.
-        cloud: file written by `las.write_cloud`; read in chunks.
+        cloud: of `las.write_cloud`; its file is read in chunks.
         rows: in capture order, in the frame of the cloud.
         title: first line of the picture.
-        mean_spacing_m: of the cloud; pixels are not made finer than it.
         georeferenced: draws a north arrow and calls lengths metres.
     """
     from PIL import Image, ImageDraw
 
-    window = _window(central_window(cloud), [row for row in rows if row.status == "placed"])
+    window = _window(cloud.window, [row for row in rows if row.status == "placed"])
     scale_px_m = min(WIDTH_PX / window.width, MAX_HEIGHT_PX / window.height)
-    view = TopView(window, max(1.0 / scale_px_m, mean_spacing_m if np.isfinite(mean_spacing_m) else 0.0))
-    for points, rgb in read_points(cloud):
+    # Pixels no finer than the points: an open cloud still gives a closed picture.
+    pixel_m = max(1.0 / scale_px_m, cloud.mean_spacing_m if np.isfinite(cloud.mean_spacing_m) else 0.0)
+    view = TopView(window, pixel_m)
+    for points, rgb in read_points(cloud.path):
         view.add(points, rgb)
     view.close_gaps()
 
@@ -66,7 +67,7 @@ def write_preview(
     _draw_title(draw, picture.width, title, rows, georeferenced)
     _draw_legend(draw, picture.size, rows, scale_px_m, "m" if georeferenced else "map units")
     with replacing(path) as temporary:
-        picture.save(temporary, format="PNG")
+        picture.save(temporary, format="PNG", compress_level=4)
 
 
 def round_length(longest: float) -> float:
@@ -75,10 +76,9 @@ def round_length(longest: float) -> float:
     return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= longest * (1.0 + 1e-9)))
 
 
-def _window(cloud: Window, placed: Sequence[CameraRow]) -> Window:
+def _window(cloud: tuple[float, float, float, float], placed: Sequence[CameraRow]) -> Window:
     positions = np.array([row.position[:2] for row in placed if row.position]).reshape(-1, 2)
-    corners = np.array([[cloud.min_x, cloud.min_y], [cloud.max_x, cloud.max_y]])
-    everything = np.concatenate([corners, positions])
+    everything = np.concatenate([np.reshape(cloud, (2, 2)), positions])
     low, high = everything.min(axis=0), everything.max(axis=0)
     side = max(float((high - low).max()), 1e-6)
     middle, half = (low + high) / 2.0, np.maximum((high - low) / 2.0, side / 8.0)  # no slivers

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..geometry.arrays import Bool, Float, UInt8
 
 CHUNK_POINTS = 1_000_000
-SAMPLE_PLACES = 40  # where the file is opened to find the bounds that matter
-SAMPLE_POINTS = 2_000
 FILL_STEPS = 2  # empty pixels this far from a filled one are filled
 
 
@@ -102,27 +99,5 @@ def read_points(path: Path) -> Iterator[tuple[Float, UInt8]]:
 
     with laspy.open(path) as reader:
         for chunk in reader.chunk_iterator(CHUNK_POINTS):
-            yield _points(chunk), _rgb(chunk)
-
-
-def central_window(path: Path, share: float = 0.005) -> Window:
-    """Return a window that leaves out about `share` of the points on each side: stray points do not shrink the view."""
-    import laspy
-
-    parts = []
-    with laspy.open(path) as reader:
-        count = reader.header.point_count
-        for start in np.unique(np.linspace(0, max(0, count - SAMPLE_POINTS), SAMPLE_PLACES).astype(np.int64)):
-            reader.seek(int(start))
-            parts.append(_points(reader.read_points(SAMPLE_POINTS))[:, :2])
-    xy = np.concatenate(parts)
-    low, high = np.quantile(xy, [share, 1.0 - share], axis=0)
-    return Window(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-
-
-def _points(chunk: Any) -> Float:
-    return np.stack([np.asarray(chunk.x), np.asarray(chunk.y), np.asarray(chunk.z)], axis=1)
-
-
-def _rgb(chunk: Any) -> UInt8:
-    return np.stack([np.asarray(band) >> 8 for band in (chunk.red, chunk.green, chunk.blue)], axis=1).astype(np.uint8)
+            rgb = np.stack([np.asarray(band) >> 8 for band in (chunk.red, chunk.green, chunk.blue)], axis=1)
+            yield np.stack([np.asarray(axis) for axis in (chunk.x, chunk.y, chunk.z)], axis=1), rgb.astype(np.uint8)
