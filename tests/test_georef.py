@@ -14,6 +14,7 @@ from onthefly3r.geometry.geoid import egm96_undulation_m
 from onthefly3r.geometry.transforms import Rigid3, Sim3, rotation_exp
 from onthefly3r.intake.folder import read_photographs
 from onthefly3r.mapping.georef import georeference, world_frame
+from onthefly3r.mapping.positions import usable_positions
 from onthefly3r.options import GeoreferenceOptions, IntakeOptions
 from onthefly3r.records import Attitude, GeoReference, GpsFix, Shot, VerticalReference
 
@@ -203,11 +204,14 @@ def test_three_positions_are_enough_with_gimbal_angles() -> None:
 
 
 def test_repeated_positions_weigh_like_one() -> None:
-    """Thirty photographs that all carry the first position would drag the fit by metres at full weight."""
+    """Twenty photographs carry the first one's position."""
     s = survey(4)
     error = s.noise(0.3)
     error[:20] = s.centres[0] - s.centres[:20]
-    found = georeference(s.map_from_cam, s.shots(error), GeoreferenceOptions(), s.ground_normal)
+    shots = s.shots(error)
+    sigma_h_m = usable_positions(range(48), shots, GeoreferenceOptions()).sigma_h_m
+    assert (sigma_h_m[:20] ** -2.0).sum() == pytest.approx(sigma_h_m[20] ** -2.0)
+    found = georeference(s.map_from_cam, shots, GeoreferenceOptions(), s.ground_normal)
     assert scale_error(found, s) < 0.02
     assert horizontal_error_m(found, s) < 1.0
     assert any("share 29 positions" in warning for warning in found.warnings)
@@ -298,21 +302,23 @@ def test_mixed_height_references_are_brought_together_and_said() -> None:
     assert any("different references" in warning for warning in found.warnings)
 
 
-@pytest.mark.parametrize(
-    ("home", "crs"),
-    [
-        (EnuFrame(-16.5, 179.9999, 20.0), "EPSG:32760"),
-        (EnuFrame(-16.5, -179.9995, 20.0), "EPSG:32701"),
-        (EnuFrame(85.0, 20.0, 20.0), "EPSG:5041"),
-    ],
-    ids=["date line west", "date line east", "pole"],
-)
-def test_edges_of_the_world(home: EnuFrame, crs: str) -> None:
+def test_a_survey_across_the_date_line() -> None:
+    """Two strips on each side of 180 degrees: their median is not in Africa."""
     s = survey(0)
+    home = EnuFrame(-16.5, 180.0 - 37.5 / 106_700.0, 20.0)
     found = georeference(s.map_from_cam, s.shots(s.noise(0.3), home=home), GeoreferenceOptions(), s.ground_normal)
-    assert found.crs in (crs, "EPSG:32701")
+    assert abs(found.origin_lon_deg) > 179.999
+    assert found.crs in ("EPSG:32760", "EPSG:32701")
     assert found.rmse_h_m < 1.0
     assert np.isfinite(world_frame(found).from_enu(np.zeros((1, 3)))).all()
+
+
+def test_beyond_utm() -> None:
+    s = survey(0)
+    home = EnuFrame(85.0, 20.0, 20.0)
+    found = georeference(s.map_from_cam, s.shots(s.noise(0.3), home=home), GeoreferenceOptions(), s.ground_normal)
+    assert found.crs == "EPSG:5041"
+    assert found.rmse_h_m < 1.0
 
 
 def test_target_crs() -> None:
