@@ -83,12 +83,10 @@ def create_environment(
     python = environment_python(folder)
     wanted = set(extras)
     installed = _read_stamp(folder)
-    stamp = {
-        "interpreter": f"{platform.python_version()} {platform.machine()} {folder}",
-        "package": _package_hash(source),
-    }
-    if installed.get("interpreter") == stamp["interpreter"] and python.exists():
-        if installed.get("package") == stamp["package"] and wanted <= set(installed["extras"]):
+    package = _package_hash(source)
+    # An environment stays usable while its own interpreter is the one that it was made with.
+    if installed and installed.get("interpreter") == _version_of(python):
+        if installed.get("package") == package and wanted <= set(installed["extras"]):
             return python
         wanted |= set(installed["extras"])
     else:
@@ -98,7 +96,8 @@ def create_environment(
     named = f"[{','.join(sorted(wanted))}]" if wanted else ""
     progress(f"Installing onthefly3r{named} into {folder}; the first time takes some minutes.")
     _pip_install(python, f"{source}{named}", constraints, progress)
-    (folder / STAMP_NAME).write_text(json.dumps({**stamp, "extras": sorted(wanted)}, indent=1), encoding="utf-8")
+    stamp = {"interpreter": _version_of(python), "package": package, "extras": sorted(wanted)}
+    (folder / STAMP_NAME).write_text(json.dumps(stamp, indent=1), encoding="utf-8")
     return python
 
 
@@ -122,6 +121,16 @@ def _read_stamp(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return stamp if isinstance(stamp, dict) and isinstance(stamp.get("extras"), list) else {}
+
+
+def _version_of(python: Path) -> str:
+    """Return an interpreter's version, empty when it does not run."""
+    command = [str(python), "-c", "import platform; print(platform.python_version())"]
+    try:
+        ran = subprocess.run(command, capture_output=True, text=True, check=False, env=clean_environ())
+    except OSError:
+        return ""
+    return ran.stdout.strip() if ran.returncode == 0 else ""
 
 
 def _package_hash(source: Path) -> str:

@@ -44,6 +44,7 @@ class Installer:
         self.python = bootstrap.environment_python
         monkeypatch.setattr(bootstrap, "_make_venv", self.make_venv)
         monkeypatch.setattr(bootstrap, "_pip_install", self.install)
+        monkeypatch.setattr(bootstrap, "_version_of", lambda python: "3.11.2" if python.exists() else "")
 
     def make_venv(self, folder: Path, progress: Any) -> None:
         self.venvs += 1
@@ -86,14 +87,25 @@ def test_changed_requirements_are_installed_into_the_same_environment(
     assert (installer.venvs, installer.requirements) == (1, [f"{source}[test]"] * 2)
 
 
-def test_another_interpreter_makes_the_environment_anew(
-    bootstrap: ModuleType, installer: Installer, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("version", ["3.12.1", ""], ids=["upgraded", "does not run"])
+def test_environment_whose_interpreter_changed_is_made_anew(
+    version: str,
+    bootstrap: ModuleType,
+    installer: Installer,
+    source: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folder = tmp_path / "environment"
     bootstrap.create_environment(folder, ("test",), source=source)
-    monkeypatch.setattr(bootstrap.platform, "python_version", lambda: "3.99.0")
+    monkeypatch.setattr(bootstrap, "_version_of", lambda python: version)
     bootstrap.create_environment(folder, (), source=source)
     assert (installer.venvs, installer.requirements) == (2, [f"{source}[test]", str(source)])
+
+
+def test_version_is_asked_of_the_interpreter_itself(bootstrap: ModuleType, tmp_path: Path) -> None:
+    assert bootstrap._version_of(Path(sys.executable)) == ".".join(map(str, sys.version_info[:3]))
+    assert bootstrap._version_of(tmp_path / "python") == ""
 
 
 def test_failed_installation_leaves_no_stamp(
