@@ -23,6 +23,7 @@ TUKEY = 4.685  # 95 % efficient
 OUTLIER_SIGMAS = 4.0
 MIN_NOISE = 0.1  # of the stated sigmas: consumer receivers stated at 3 m repeat to 0.3 m at best
 MAX_CORRELATION = 0.98
+MAX_INDEPENDENT = 20.0  # the map's own bending does not average out, however many positions there are
 TREND_CORE = 4.0  # squared sigmas beyond which height drift is an accident and no longer noise
 
 
@@ -191,7 +192,8 @@ class _Solver:
         ratio = ratio - ratio.mean(axis=0)
         lagged, power = float((ratio[1:] * ratio[:-1]).sum()), float((ratio**2).sum())
         correlation = min(max(lagged / max(power, 1e-12), 0.0), MAX_CORRELATION)
-        self.independence = max((1.0 - correlation) / (1.0 + correlation), min(1.0, 2.0 / n))
+        share = min((1.0 - correlation) / (1.0 + correlation), MAX_INDEPENDENT / n)
+        self.independence = max(share, min(1.0, 2.0 / n))
 
     def _sigmas(self) -> Float:
         p = self.positions
