@@ -69,7 +69,7 @@ class MapAnything(TorchBackbone):
         arguments["info_sharing_config"].get("module_args", {}).pop("pretrained_checkpoint_path", None)
         try:
             return Network(**arguments), state
-        except OSError as error:  # the encoder's code comes through torch.hub, from its cache or the network
+        except (OSError, RuntimeError) as error:  # torch.hub fetches the encoder's code, or has it in its cache
             raise MissingDependencyError(
                 "backbone mapanything: the code of its DINOv2 encoder cannot be fetched; online, run once in Python: "
                 "import torch; torch.hub.load('facebookresearch/dinov2', 'dinov2_vitg14', pretrained=False)"

@@ -139,7 +139,7 @@ class SupSceneDescriber(NetworkDescriber):
         try:
             with quiet_upstream(), _working_folder(checkout):  # it looks for its copy of DINOv2 from there
                 network = torch.hub.load(".", "dinov2_scpp_supscene_1536", source="local", pretrained=False)
-        except OSError as error:
+        except (OSError, RuntimeError) as error:
             raise MissingDependencyError(
                 f"descriptor {self.name}: cannot be built ({error}); {self.install}"
             ) from error
