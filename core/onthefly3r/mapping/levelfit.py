@@ -14,11 +14,10 @@ import numpy as np
 
 from ..geometry.arrays import Bool, Float
 from ..geometry.transforms import Sim3, nearest_rotation, rotation_exp, skew
-from ..geometry.umeyama import weighted_similarity
+from .fitstart import free_start, level_start
 from .positions import Positions
 from .updirection import UpWitness, cauchy_cost, cauchy_weight, squared_misfit
 
-SAMPLES = 600  # of RANSAC; with half the positions wrong, 600 pairs hold about 150 good ones
 TUKEY = 4.685  # 95 % efficient
 OUTLIER_SIGMAS = 4.0
 MIN_NOISE = 0.1  # of the stated sigmas: consumer receivers stated at 3 m repeat to 0.3 m at best
@@ -49,8 +48,8 @@ def fit(centres: Float, positions: Positions, first_up: Float, witnesses: Sequen
     Starts from the witnesses' up direction and from the positions alone, and keeps the more probable end.
     """
     random = np.random.default_rng(seed)
-    starts = [_level_start(centres, positions, first_up, random)]
-    free = _free_start(centres, positions, random)
+    starts = [level_start(centres, positions, first_up, random)]
+    free = free_start(centres, positions, random)
     if free is not None:
         starts.append(free)
     solvers = [_Solver(centres, positions, witnesses, start) for start in starts]
@@ -61,67 +60,6 @@ def fit(centres: Float, positions: Positions, first_up: Float, witnesses: Sequen
     # The witnesses' rows cannot tell up from down: an end that hangs upside down does not count.
     upright = [s for s in solvers if float(s.transform.rotation[2] @ first_up) > 0.0] or solvers[:1]
     return min((solver.result(noise) for solver in upright), key=lambda result: result.cost)
-
-
-def _level_start(centres: Float, positions: Positions, up: Float, random: np.random.Generator) -> Sim3:
-    """Return the least-median-of-squares plane similarity with a given up direction; heights by their median."""
-    level = _level_rotation(up)
-    flat = centres @ level.T
-    source, target = flat[:, 0] + 1j * flat[:, 1], positions.enu[:, 0] + 1j * positions.enu[:, 1]
-    first, second = random.integers(0, len(centres), (2, SAMPLES))
-    span = np.abs(source[first] - source[second])
-    good = span > 0.1 * np.median(np.abs(source - np.median(source.real) - 1j * np.median(source.imag)))
-    first, second = first[good], second[good]
-    turn = (target[first] - target[second]) / (source[first] - source[second])
-    turn = turn[np.abs(turn) > 1e-12]
-    best, best_score = (1.0 + 0.0j, 0.0 + 0.0j), np.inf
-    for candidate in turn:
-        offsets = target - candidate * source
-        shift = np.median(offsets.real) + 1j * np.median(offsets.imag)
-        score = float(np.median(np.abs(offsets - shift) / positions.sigma_h_m))
-        if score < best_score:
-            best, best_score = (candidate, shift), score
-    (turn_best, shift_best), scale = best, abs(best[0])
-    yaw = np.array([[turn_best.real, -turn_best.imag, 0.0], [turn_best.imag, turn_best.real, 0.0], [0.0, 0.0, scale]])
-    seen = positions.has_height if positions.has_height.any() else np.ones(len(centres), bool)
-    lift = float(np.median((positions.enu[:, 2] - scale * flat[:, 2])[seen]))
-    return Sim3(scale, nearest_rotation(yaw / scale @ level), np.array([shift_best.real, shift_best.imag, lift]))
-
-
-def _free_start(centres: Float, positions: Positions, random: np.random.Generator) -> Sim3 | None:
-    """Return the least-median-of-squares similarity of position triples; None when no triple determines one."""
-    seen = np.flatnonzero(positions.has_height)
-    if len(seen) < 4:
-        return None
-    best, best_score = None, np.inf
-    for _ in range(SAMPLES // 2):
-        triple = random.choice(seen, 3, replace=False)
-        try:
-            candidate = weighted_similarity(centres[triple], positions.enu[triple], np.ones(3))
-        except ValueError:
-            continue
-        if not candidate.scale > 1e-9:
-            continue
-        residual = (positions.enu - candidate.apply(centres))[seen]
-        score = float(
-            np.median(
-                np.hypot(
-                    np.hypot(residual[:, 0], residual[:, 1]) / positions.sigma_h_m[seen],
-                    residual[:, 2] / positions.sigma_v_m[seen],
-                )
-            )
-        )
-        if score < best_score:
-            best, best_score = candidate, score
-    return best
-
-
-def _level_rotation(up: Float) -> Float:
-    """Return any rotation that turns `up` into the z axis."""
-    least = np.eye(3)[int(np.argmin(np.abs(up)))]
-    x = skew(up) @ least
-    x = x / float(np.linalg.norm(x))
-    return np.stack([x, skew(up) @ x, up])
 
 
 class _Solver:
