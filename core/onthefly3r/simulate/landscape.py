@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
-from ..geometry.arrays import Float
+from ..geometry.arrays import Float, Int
 from .texture import ROAD_HALF_WIDTH_M, Texture
 
 GROUND, ROOF, WALL, TREE = 0, 1, 2, 3
@@ -100,17 +101,24 @@ def building(centre: Float, size: Float, yaw: float, floor_m: float, gable_m: fl
     return patches
 
 
-def tree(centre: Float, radius_m: float, floor_m: float, rng: np.random.Generator) -> Patch:
-    """Return a lumpy crown that stands on the ground at centre (2,)."""
+@lru_cache(maxsize=1)
+def _unit_sphere() -> tuple[Float, Int]:
+    """Return vertices (V, 3) and faces (F, 3)."""
     import trimesh
 
     sphere = trimesh.creation.icosphere(subdivisions=2)
-    lumps = 1.0 + 0.12 * rng.standard_normal((len(sphere.vertices), 1))
-    vertices = np.asarray(sphere.vertices) * lumps * radius_m * (1.0, 1.0, rng.uniform(0.9, 1.6))
+    return np.asarray(sphere.vertices), np.asarray(sphere.faces)
+
+
+def tree(centre: Float, radius_m: float, floor_m: float, rng: np.random.Generator) -> Patch:
+    """Return a lumpy crown that stands on the ground at centre (2,)."""
+    sphere, faces = _unit_sphere()
+    lumps = 1.0 + 0.12 * rng.standard_normal((len(sphere), 1))
+    vertices = sphere * lumps * radius_m * (1.0, 1.0, rng.uniform(0.9, 1.6))
     vertices += (centre[0], centre[1], floor_m - 0.3 - vertices[:, 2].min())
     green = np.array((52, 82, 40), float) * rng.uniform(0.8, 1.3)
     slanted_u, slanted_v = np.array([1.0, 0.0, 0.7]), np.array([0.0, 1.0, -0.4])
-    return Patch(vertices[sphere.faces], TREE, green, slanted_u, slanted_v, rng.uniform(0.0, 500.0, 2))
+    return Patch(vertices[faces], TREE, green, slanted_u, slanted_v, rng.uniform(0.0, 500.0, 2))
 
 
 def scatter_objects(

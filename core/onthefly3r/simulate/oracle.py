@@ -155,23 +155,26 @@ class OracleBackbone:
 
 @dataclass(frozen=True, eq=False)
 class Bowl:
-    """A smooth vertical bend: up by sag_m * (r / radius_m)^2 at the horizontal distance r from the middle."""
+    """A bend of space: the ground rises by sag_m * (r / radius_m)^2 at distance r, plumb lines stay normal to it."""
 
-    middle: Float  # (3,) ENU m
+    middle: Float  # (3,) ENU m; its height does not matter
     sag_m: float
     radius_m: float
 
     def apply(self, points: Float) -> Float:
         """Bend points (..., 3) in ENU."""
-        offset = (points - self.middle)[..., :2] / self.radius_m
-        up = self.sag_m * np.sum(offset**2, axis=-1)
-        return np.asarray(points + np.stack([np.zeros_like(up), np.zeros_like(up), up], axis=-1))
+        offset = (points - self.middle)[..., :2]
+        rise = self.sag_m / self.radius_m**2 * np.sum(offset**2, axis=-1, keepdims=True)
+        return np.asarray(points + np.concatenate([-points[..., 2:] * self._slope(points), rise], axis=-1))
 
     def apply_to_pose(self, enu_from_cam: Rigid3) -> Rigid3:
         """Bend a camera: it moves with the place where it is and turns with the slope there."""
-        slope = 2.0 * self.sag_m * (enu_from_cam.translation - self.middle)[:2] / self.radius_m**2
+        slope = self._slope(enu_from_cam.translation)
         turn = rotation_exp(np.array([slope[1], -slope[0], 0.0]))
         return Rigid3(turn @ enu_from_cam.rotation, self.apply(enu_from_cam.translation))
+
+    def _slope(self, points: Float) -> Float:
+        return np.asarray(2.0 * self.sag_m / self.radius_m**2 * (points - self.middle)[..., :2])
 
 
 class OracleDescriber:
