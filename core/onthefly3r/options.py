@@ -59,7 +59,8 @@ class SelectionOptions:
 
     seed_size: int = option(30, "images of the first joint reconstruction (N0)", unit="images", minimum=3)
     batch_size: int = option(5, "most new images in one subset (B_max)", unit="images", minimum=1)
-    references: int = option(5, "references retrieved per image and used per subset (k_r)", unit="images", minimum=3)
+    references: int = option(5, "references retrieved per image (k_r)", unit="images", minimum=3)
+    subset_references: int = option(8, "most references in one subset (R_k)", unit="images", minimum=3)
     min_shared_references: int = option(
         2, "references an image must share with the batch it joins (tau_o)", unit="images", minimum=0, advanced=True
     )
@@ -214,6 +215,7 @@ class Options:
 # What the paper does where our default differs; later improvements switched off.
 PAPER_VALUES: dict[str, Any] = {
     "lookahead": 1,
+    "subset_references": 5,
     "gps_candidates": False,
     "validate_queries": False,
     "max_retries": 0,

@@ -155,8 +155,7 @@ class Alignment:
     """The Sim(3) of a subset to the map (Eq. 11) and how well it is known."""
 
     map_from_local: Sim3
-    covariance: Float  # (7, 7) of [rotation rad, translation map units, log scale], left perturbation at the centroid
-    centroid: Float  # (3,) map frame: where the perturbation is anchored
+    covariance: Float  # (7, 7) of [rotation rad, translation, log scale], right perturbation in the local frame
     inlier_ratio: float
     residual: float  # robust standard deviation of the residuals, map units
     n_points: int

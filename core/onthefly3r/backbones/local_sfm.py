@@ -1,0 +1,148 @@
+"""Incremental structure from motion of one subset with pycolmap, all in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..geometry.arrays import Float, Int
+from ..geometry.camera import Camera
+from ..geometry.transforms import Rigid3
+from ..records import Features
+from .matching import to_pycolmap_camera
+
+MIN_MODEL_SIZE = 3
+
+
+@dataclass(frozen=True)
+class Track:
+    """The triangulated features of one image."""
+
+    features: Int  # (M,) index into the image's features, ascending
+    points: Int  # (M,) index into SparseModel.points
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """Poses, intrinsics and points of the images that could be placed, in an arbitrary frame."""
+
+    local_from_cam: Mapping[int, Rigid3]
+    cameras: Mapping[str, Camera]  # by camera key, working size
+    points: Float  # (N, 3)
+    reprojection_px: Float  # (N,) mean reprojection error
+    track_length: Int  # (N,)
+    tracks: Mapping[int, Track]
+    mean_reprojection_px: float
+
+
+def local_sfm(
+    features: Mapping[int, Features],
+    keys: Mapping[int, str],
+    cameras: Mapping[str, Camera],
+    held: frozenset[str],
+    geometries: Mapping[tuple[int, int], Any],
+    refine_focal: bool,
+    threads: int,
+) -> SparseModel | None:
+    """Return the largest model of the subset, or None when no three images hold together.
+
+    Intrinsics of the camera keys in `held` stay as given; the others are refined in the bundle adjustment.
+    """
+    import pycolmap
+
+    camera_ids = {key: number for number, key in enumerate(sorted(cameras), start=1)}
+    cache = _database_cache(features, keys, cameras, camera_ids, geometries)
+    options = _pipeline_options(refine_focal, threads)
+    options.constant_cameras = {camera_ids[key] for key in held if key in camera_ids}
+    manager = pycolmap.ReconstructionManager()
+    pycolmap.IncrementalPipeline(options, cache, manager).run()
+    models = [manager.get(i) for i in range(manager.size())]
+    models = [model for model in models if model.num_reg_images() >= MIN_MODEL_SIZE]
+    if not models:
+        return None
+    return _to_sparse_model(max(models, key=lambda model: model.num_reg_images()), camera_ids)
+
+
+def _database_cache(
+    features: Mapping[int, Features],
+    keys: Mapping[int, str],
+    cameras: Mapping[str, Camera],
+    camera_ids: Mapping[str, int],
+    geometries: Mapping[tuple[int, int], Any],
+) -> Any:
+    import pycolmap
+
+    database = pycolmap.Database.open(":memory:")
+    for key, camera_id in camera_ids.items():
+        database.write_camera(to_pycolmap_camera(cameras[key], camera_id), use_camera_id=True)
+    for camera_id in camera_ids.values():
+        rig = pycolmap.Rig(rig_id=camera_id)
+        rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id))
+        database.write_rig(rig, use_rig_id=True)
+    for index, image_features in features.items():
+        image_id, camera_id = index + 1, camera_ids[keys[index]]
+        database.write_image(
+            pycolmap.Image(name=str(index), camera_id=camera_id, image_id=image_id),
+            use_image_id=True,
+        )
+        frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
+        frame.add_data_id(
+            pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id), image_id)
+        )
+        database.write_frame(frame, use_frame_id=True)
+        database.write_keypoints(image_id, image_features.pixels)
+    for (first, second), geometry in geometries.items():
+        if len(geometry.inlier_matches):
+            database.write_two_view_geometry(first + 1, second + 1, geometry)
+    cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
+    database.close()
+    return cache
+
+
+def _pipeline_options(refine_focal: bool, threads: int) -> Any:
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = threads
+    options.random_seed = 0
+    options.min_model_size = MIN_MODEL_SIZE
+    options.multiple_models = False
+    options.extract_colors = False
+    options.ba_refine_focal_length = refine_focal
+    options.mapper.abs_pose_refine_focal_length = False
+    options.mapper.abs_pose_refine_extra_params = False
+    return options
+
+
+def _to_sparse_model(model: Any, camera_ids: Mapping[str, int]) -> SparseModel:
+    point_ids = sorted(model.points3D)
+    row = {point_id: i for i, point_id in enumerate(point_ids)}
+    stored = [model.points3D[point_id] for point_id in point_ids]
+    poses, tracks = {}, {}
+    for image in model.images.values():
+        if not image.has_pose:
+            continue
+        index = image.image_id - 1
+        cam_from_local = image.cam_from_world()
+        poses[index] = Rigid3(cam_from_local.rotation.matrix(), np.asarray(cam_from_local.translation)).inverse()
+        seen = [(i, row[p.point3D_id]) for i, p in enumerate(image.points2D) if p.has_point3D()]
+        table = np.array(seen, np.int64).reshape(-1, 2)
+        tracks[index] = Track(table[:, 0], table[:, 1])
+    used = {camera_id: camera for camera_id, camera in model.cameras.items()}
+    return SparseModel(
+        local_from_cam=poses,
+        cameras={key: _from_pycolmap(used[camera_id]) for key, camera_id in camera_ids.items() if camera_id in used},
+        points=np.array([point.xyz for point in stored]).reshape(-1, 3),
+        reprojection_px=np.array([point.error for point in stored]),
+        track_length=np.array([point.track.length() for point in stored]),
+        tracks=tracks,
+        mean_reprojection_px=float(model.compute_mean_reprojection_error()),
+    )
+
+
+def _from_pycolmap(camera: Any) -> Camera:
+    fx, fy, cx, cy, k1, k2, p1, p2 = (float(p) for p in camera.params)
+    return Camera(int(camera.width), int(camera.height), fx, fy, cx, cy, (k1, k2, p1, p2))

@@ -1,0 +1,76 @@
+"""Compact geometric references (Eq. 2) and the correspondences that they give (Eq. 10)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..geometry.arrays import Float
+from ..geometry.transforms import Sim3
+from ..records import CompactReference, Correspondences, LocalModel, LocalView
+
+CELLS_ACROSS = 16
+
+
+def compact_reference(view: LocalView, max_points: int, min_confidence: float) -> CompactReference:
+    """Return H_i (Eq. 2): the most confident points of each cell of a regular image grid, the same number per cell."""
+    height, width = view.confidence.shape
+    rows, columns = np.nonzero((view.confidence >= min_confidence) & np.isfinite(view.points).all(axis=-1))
+    confidence = view.confidence[rows, columns]
+    cell_px = max(1, -(-width // CELLS_ACROSS))
+    cells_down = -(-height // cell_px)
+    cell = (rows // cell_px) * CELLS_ACROSS + columns // cell_px
+    per_cell = max(1, max_points // (CELLS_ACROSS * cells_down))
+    order = np.lexsort((-confidence, cell))  # by cell, most confident first
+    sorted_cell = cell[order]
+    first_of_cell = np.searchsorted(sorted_cell, sorted_cell, side="left")
+    kept = order[np.arange(len(order)) - first_of_cell < per_cell]
+    rows, columns = rows[kept], columns[kept]
+    return CompactReference(
+        pixels=np.column_stack([columns, rows]).astype(np.int32),
+        points=view.points[rows, columns].astype(np.float32),
+        confidence=view.confidence[rows, columns].astype(np.float32),
+    )
+
+
+def correspond(
+    model: LocalModel,
+    references: Mapping[int, CompactReference],
+    map_from_submap: Mapping[int, Sim3],
+    min_confidence: float,
+) -> Correspondences:
+    """Pair stored map points with the local points at the same pixels (Eq. 10).
+
+    Args:
+        model: the new local model.
+        references: H_r by shot index, of references that the model may contain.
+        map_from_submap: for each of them, the pose of the submap that predicted its points.
+        min_confidence: local points below it are not used.
+    """
+    local, mapped, weight, source = [], [], [], []
+    for index, reference in references.items():
+        view = model.views.get(index)
+        if view is None or len(reference.pixels) == 0:
+            continue
+        columns, rows = reference.pixels[:, 0], reference.pixels[:, 1]
+        points, confidence = view.points[rows, columns].astype(float), view.confidence[rows, columns].astype(float)
+        valid = (confidence >= min_confidence) & np.isfinite(points).all(axis=-1)
+        local.append(points[valid])
+        mapped.append(map_from_submap[index].apply(reference.points[valid].astype(float)))
+        weight.append(np.sqrt(confidence[valid] * reference.confidence[valid]))  # w = sqrt(c_local c_global), Eq. 10
+        source.append(np.full(int(valid.sum()), index))
+    if not local:
+        return Correspondences(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, int))
+    return Correspondences(np.vstack(local), np.vstack(mapped), np.concatenate(weight), np.concatenate(source))
+
+
+def scene_spacing(views: Mapping[int, LocalView], min_confidence: float) -> float:
+    """Return l_scene: the median 3D distance of neighbouring confident pixels (paper Sec. III-B), NaN if none."""
+    steps: list[Float] = []
+    for view in views.values():
+        trusted = np.where((view.confidence >= min_confidence)[..., None], view.points, np.nan)
+        distance = np.linalg.norm(np.diff(trusted, axis=1), axis=-1)
+        steps.append(distance[np.isfinite(distance)])
+    joined = np.concatenate(steps) if steps else np.zeros(0)
+    return float(np.median(joined)) if len(joined) else float("nan")

@@ -1,0 +1,66 @@
+"""The embedded retrieval descriptor: VLAD over the RootSIFT features of the backbone, no download."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from ..geometry.arrays import Float
+from ..records import Features, WorkingImage
+
+WORDS = 64
+TRAINING_FEATURES = 40_000
+
+
+class VladDescriber:
+    """Vector of locally aggregated descriptors (Jegou et al. 2010), codebook learnt from the first images.
+
+    `features_of` returns the cached features of an image by shot index. Residuals are L2-normalised per word
+    (Arandjelovic & Zisserman 2013), then the whole vector: D = 64 * 128.
+    """
+
+    def __init__(self, features_of: Callable[[int, WorkingImage], Features], seed: int = 0) -> None:
+        self._features_of = features_of
+        self._seed = seed
+        self._words: Float | None = None  # (WORDS, 128)
+
+    def fit(self, images: Mapping[int, WorkingImage]) -> None:
+        """Learn the visual words from the features of the first images."""
+        import cv2
+
+        rng = np.random.default_rng(self._seed)
+        per_image = max(1, TRAINING_FEATURES // max(len(images), 1))
+        samples = []
+        for index in images:
+            vectors = _unit(self._features_of(index, images[index]).descriptors)
+            samples.append(vectors[rng.permutation(len(vectors))[:per_image]])
+        training = np.vstack(samples) if samples else np.zeros((0, 128), np.float32)
+        if len(training) < WORDS:  # next to no texture: any words do, retrieval will find nothing either way
+            training = _unit(rng.integers(1, 255, (WORDS, 128)))
+        cv2.setRNGSeed(self._seed)
+        criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 15, 1e-4)
+        _, _, words = cv2.kmeans(training, WORDS, None, criteria, 1, cv2.KMEANS_PP_CENTERS)  # type: ignore[call-overload]
+        self._words = np.asarray(words, np.float32)
+
+    def describe(self, index: int, image: WorkingImage) -> Float:
+        """Return the L2-normalised descriptor (8192,) float32; zeros for an image without features."""
+        if self._words is None:
+            raise RuntimeError("describe() before fit()")
+        vectors = _unit(self._features_of(index, image).descriptors)
+        if len(vectors) == 0:
+            return np.zeros(WORDS * 128, np.float32)
+        # Nearest word by |v - w|^2 = 1 - 2 v.w + |w|^2.
+        word = (vectors @ self._words.T - 0.5 * (self._words**2).sum(axis=1)).argmax(axis=1)
+        residual = np.zeros((WORDS, 128), np.float32)
+        for k in np.unique(word):
+            members = vectors[word == k]
+            residual[k] = members.sum(axis=0) - len(members) * self._words[k]
+        residual /= np.maximum(np.linalg.norm(residual, axis=1, keepdims=True), 1e-12)
+        flat = residual.ravel()
+        return np.asarray(flat / np.linalg.norm(flat), np.float32)
+
+
+def _unit(descriptors: Float) -> Float:
+    vectors = np.asarray(descriptors, np.float32)
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))

@@ -1,0 +1,76 @@
+"""Retrieval-guided dynamic subsets (paper Sec. III-C): which images are reconstructed together next."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+
+from ..options import SelectionOptions
+from ..records import Neighbour, Subset
+
+Similarity = Callable[[int, int], float]
+
+
+def dominant_references(
+    batch: Sequence[int], neighbours: Mapping[int, Sequence[Neighbour]], count: int
+) -> tuple[int, ...]:
+    """Return the references that most images of a batch share, then those of the highest summed similarity.
+
+    This is D(Q) of Eq. 6 and, for the final batch, R_k of Eq. 8.
+    """
+    votes: Counter[int] = Counter()
+    score: Counter[int] = Counter()
+    for query in batch:
+        for neighbour in neighbours[query]:
+            votes[neighbour.index] += 1
+            score[neighbour.index] += neighbour.similarity  # type: ignore[assignment]
+    ranked = sorted(votes, key=lambda r: (-votes[r], -score[r], r))
+    return tuple(ranked[:count])
+
+
+def build_subset(
+    waiting: Sequence[int],
+    neighbours: Mapping[int, Sequence[Neighbour]],
+    similarity: Similarity,
+    options: SelectionOptions,
+) -> Subset:
+    """Return the next subset B_k = R_k + Q_k (Eq. 8) from the waiting images, oldest first.
+
+    With a look-ahead of one the batch grows in arrival order and stops at the first image that does not fit, as in
+    the paper. A longer look-ahead starts at the image that is best tied to the map and always admits the best
+    fitting image within it, so that shuffled input fills batches too.
+    """
+    window = list(waiting[: options.lookahead]) if options.lookahead > 1 else list(waiting)
+    strict_order = options.lookahead == 1
+    start = window[0] if strict_order else max(window, key=lambda q: (_support(neighbours[q]), -window.index(q)))
+    batch = [start]
+    window.remove(start)
+    while window and len(batch) < options.batch_size:
+        dominant = set(dominant_references(batch, neighbours, options.references))
+        if strict_order:
+            best = window[0]
+        else:
+            best = max(window, key=lambda q: _fit(q, batch, dominant, neighbours, similarity))
+        overlap, closeness = _fit(best, batch, dominant, neighbours, similarity)
+        if overlap < options.min_shared_references or closeness < options.min_similarity:  # Eq. 7
+            break
+        batch.append(best)
+        window.remove(best)
+    references = dominant_references(batch, neighbours, options.subset_references)
+    return Subset(references=references, new=tuple(batch))
+
+
+def _support(neighbours: Sequence[Neighbour]) -> float:
+    return sum(n.similarity for n in neighbours[:3])
+
+
+def _fit(
+    query: int,
+    batch: Sequence[int],
+    dominant: set[int],
+    neighbours: Mapping[int, Sequence[Neighbour]],
+    similarity: Similarity,
+) -> tuple[int, float]:
+    overlap = len({n.index for n in neighbours[query]} & dominant)  # o(q, Q), Eq. 6
+    closeness = max(similarity(query, member) for member in batch)  # s_max(q, Q), Eq. 6
+    return overlap, closeness
