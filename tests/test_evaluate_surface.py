@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
 from onthefly3r.errors import ReferenceFormatError
-from onthefly3r.evaluate import clouds
+from onthefly3r.evaluate import clouds, surface
 from onthefly3r.evaluate.clouds import CloudFile, open_cloud
 from onthefly3r.evaluate.surface import ground_difference, surface_errors
 from onthefly3r.geometry.transforms import Sim3, rotation_exp
@@ -48,6 +48,16 @@ def test_agrees_with_all_pairs(seed: int, chunk: int) -> None:
     assert errors.completeness == pytest.approx(distance.min(axis=0).mean(), rel=1e-9)
     assert errors.completeness_median == pytest.approx(np.median(distance.min(axis=0)), rel=1e-9)
     assert errors.chamfer == pytest.approx((errors.accuracy + errors.completeness) / 2)
+
+
+def test_far_and_near_parts_are_all_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The coarse first bound is poor here, and the chunks lie apart, as tiles of a cloud do."""
+    monkeypatch.setattr(surface, "COARSE_POINTS", 30)
+    rng = np.random.default_rng(0)
+    a, b = rng.uniform(0, 50, (2, 3_000, 3))
+    b = b[np.argsort(b[:, 0])]
+    errors = surface_errors(cloud(a), cloud(b, 100))
+    assert errors.accuracy == pytest.approx(cdist(a, b).min(axis=1).mean(), rel=1e-9)
 
 
 def test_half_a_cloud_is_accurate_but_not_complete() -> None:

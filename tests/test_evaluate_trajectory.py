@@ -158,6 +158,11 @@ def test_a_file_name_that_could_be_two_images_is_refused() -> None:
         match(named("a/x.jpg", "b/x.jpg"), named("x.jpg"))
 
 
+def test_an_image_is_matched_once() -> None:
+    rows, others = match(named("x.jpg", "b/x.jpg"), named("b/x.jpg"))
+    assert (rows.tolist(), others.tolist()) == ([1], [0])
+
+
 def test_nothing_in_common_is_said() -> None:
     with pytest.raises(ReferenceFormatError, match="none of its 1 images"):
         match(named("x.jpg"), named("y.jpg"))

@@ -140,6 +140,10 @@ def test_result_does_not_depend_on_tiles_quarters_and_buffers(
 ) -> None:
     rng = np.random.default_rng(5)
     batches = [batch(ground(rng, 3_000, 20.0, noise_m=0.3), source, 0.6) for source in range(4)]
+    # Groups of three to seven above it, of which the stray filter drops some, at the borders too.
+    places = np.column_stack([rng.uniform(0, 20, (600, 2)), rng.uniform(9, 200, 600)])
+    groups = np.repeat(ORIGIN + places, rng.integers(3, 8, 600), axis=0)
+    batches.append(batch(groups + rng.normal(0, 0.25, groups.shape), 4, 0.6))
     whole = joined(fuse(batches, 0.25, 0.5, tmp_path, stray_filter=True))
     monkeypatch.setattr(fuse_module, "TILE_VOXELS", tile_voxels)
     monkeypatch.setattr(fuse_module, "MAX_SQUARE_POINTS", square_points)
@@ -147,6 +151,8 @@ def test_result_does_not_depend_on_tiles_quarters_and_buffers(
     pieces = list(fuse(batches, 0.25, 0.5, tmp_path, stray_filter=True))
     cut = joined(pieces)
     assert len(pieces) > 4
+    everything = joined(fuse(batches, 0.25, 0.5, tmp_path, stray_filter=False))
+    assert 300 < len(everything.points) - len(whole.points) < 3_000
     assert len(cut.points) == len(whole.points)
     by_place = [np.lexsort(np.round(cloud.points, 6).T) for cloud in (whole, cut)]
     assert np.allclose(whole.points[by_place[0]], cut.points[by_place[1]], atol=1e-6)

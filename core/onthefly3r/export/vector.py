@@ -77,10 +77,7 @@ def write_cameras(path: Path, rows: Iterable[CameraRow], crs: str | None) -> int
 def _esri_wkt(crs: str) -> str:
     from pyproj import CRS
 
-    horizontal = CRS.from_user_input(crs)
-    if horizontal.is_compound:
-        horizontal = horizontal.sub_crs_list[0]
-    return str(horizontal.to_2d().to_wkt("WKT1_ESRI"))
+    return str(CRS.from_user_input(crs).to_2d().to_wkt("WKT1_ESRI"))
 
 
 def _record(row: CameraRow) -> list[object]:
