@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import importlib
 import json
 import sys
 from pathlib import Path
@@ -10,7 +9,11 @@ import pytest
 
 from onthefly3r.errors import InputError, MissingDependencyError, ReferenceFormatError
 from onthefly3r.evaluate import icp
+from onthefly3r.evaluate.clouds import open_cloud
+from onthefly3r.evaluate.readers import read_poses, scene_depth
 from onthefly3r.evaluate.run import evaluate, format_table
+from onthefly3r.evaluate.surface import ground_difference
+from onthefly3r.evaluate.trajectory import pose_errors
 from onthefly3r.export.colmap import write_model
 from onthefly3r.export.las import write_cloud
 from onthefly3r.export.rows import placed_row
@@ -100,14 +103,6 @@ def test_without_open3d_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> 
         icp.import_open3d()
 
 
-@pytest.fixture
-def open3d() -> None:
-    try:
-        importlib.import_module("open3d")
-    except (ImportError, OSError) as error:
-        pytest.skip(f"open3d cannot be imported, ICP is not tested: {error}")
-
-
 @pytest.mark.usefixtures("open3d")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_icp_finds_a_small_motion(tmp_path: Path) -> None:
@@ -131,3 +126,31 @@ def test_icp_refuses_clouds_that_are_far_apart(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", Sim3(1.0, np.eye(3), np.array([500.0, 0, 0])), surface())
     with pytest.raises(ReferenceFormatError, match="same CRS"):
         evaluate(run, None, truth, icp=True)
+
+
+@pytest.mark.photographs
+def test_reference_models_of_the_photographs(photograph_sets: Path) -> None:
+    """Every reference is read whole; against itself turned, scaled and shifted nothing is left."""
+    for folder in sorted(photograph_sets.glob("*/reference")):
+        reference = read_poses(folder)
+        assert len(reference.names) == json.loads((folder / "summary.json").read_text())["images"]
+        assert all((folder.parent / "photos" / name).is_file() for name in reference.names)
+        moved = reference.moved(Sim3(9.0, rotation_exp(np.array([0.1, 2.0, 0.3])), np.array([5e5, 5e6, 100.0])))
+        errors = pose_errors(moved, reference)
+        assert errors.ate < 1e-6
+        assert errors.are_deg < 1e-4
+        depth = scene_depth(folder)
+        assert depth is not None
+        assert 4.0 < depth < 5.0
+
+
+@pytest.mark.photographs
+def test_cloud_of_another_program(photograph_sets: Path) -> None:
+    file = photograph_sets / "brighton_beach" / "reference" / "odm_cloud.laz"
+    if not file.is_file():
+        pytest.skip(f"no {file}")
+    other = open_cloud(file)
+    assert other.n_points == 940_393
+    difference = ground_difference(other, other, 1.0, Sim3(1.0, np.eye(3), np.array([0.0, 0.0, -1.75])))
+    assert difference.median == pytest.approx(-1.75)
+    assert difference.n_cells > 3_000

@@ -26,7 +26,7 @@ POINT = np.dtype(
     ],
     align=True,
 )
-BUFFER_POINTS = 2_000_000
+BUFFER_POINTS = 1_000_000
 MAX_REACH_VOXELS = 2**27  # points further from the first batch are blunders and left out
 
 Tile = tuple[int, int]  # column, row; tile (0, 0) begins at the origin of the export frame
