@@ -1,0 +1,328 @@
+"""Dense point maps of a subset's new images by stereo with their best partners, joined with the sparse points.
+
+Depths of a view are measured along z of its camera; a standard deviation counts in depth units. The GSD of a point
+is its depth over the focal length of the working image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ..geometry.arrays import Bool, Float, Int, UInt8
+from ..geometry.camera import Camera
+from ..records import Features
+from .local_sfm import SparseModel
+from .rectify import rectify
+from .stereo import disparity
+
+BEST_ANGLE_DEG = 14.0  # between the rays of the two images: wide enough to be precise, small enough to match
+ANGLE_SPREAD = 0.6  # standard deviation of its logarithm
+COVERED_TWICE = 0.35  # worth of a point that an earlier partner sees too
+MIN_SHARED_POINTS = 12
+RANGE_MARGIN = 0.2  # disparities searched beyond those of the sparse points, relative to their range
+FINER = 2.0  # stereo runs at this multiple of the point map's resolution, at most at that of the image
+
+SIGMA_FACTOR = 2.0  # true over formal standard deviation of disparities: the residuals of a window are correlated
+SIGMA_FLOOR_PX = 0.05  # of disparities, from poses and intrinsics
+AGREEMENT_SIGMAS, AGREEMENT_GSD = 3.0, 1.0
+EDGE_PX = 1.0  # disparities of neighbours farther apart are not interpolated
+
+SIGMA_HALF_GSD = 2.0  # depth precision at which a point is worth half
+TRUST_ALONE, TRUST_AGREED, TRUST_DISPUTED = 0.7, 0.95, 0.25
+CONFIRMED, CONTRADICTED = 0.6, 0.3  # factors of doubt and of trust for each other view that says so
+CHECKING_VIEWS = 3
+
+KEYPOINT_SIGMA_PX = 0.5
+CELL_MARGIN_PX = 0.5  # of the point map: a sparse point must project so near to the pixel of its keypoint
+
+
+@dataclass(frozen=True)
+class DenseView:
+    """The point map of one image."""
+
+    points: Float  # (H, W, 3) float32, local frame; NaN where nothing is known
+    confidence: Float  # (H, W) float32 in 0..1; 0 where points are NaN
+
+
+@dataclass(frozen=True)
+class _DepthMap:
+    """Depths of one view and how far they can be trusted."""
+
+    depth: Float  # (H, W) float32 local units; NaN where unknown
+    sigma: Float  # (H, W) float32 local units
+    trust: Float  # (H, W) float32 in 0..1: that the match is right
+
+
+def dense_views(
+    new: Sequence[int],
+    images: Mapping[int, UInt8],
+    model: SparseModel,
+    keys: Mapping[int, str],
+    features: Mapping[int, Features],
+    grids: Mapping[int, tuple[int, int]],
+    partners: int = 2,
+    threads: int = 2,
+) -> dict[int, DenseView]:
+    """Return the point maps of those new images that the sparse model has placed, checked against each other.
+
+    At the pixel of a triangulated keypoint the map holds the sparse point itself (`sparse_view`).
+
+    Args:
+        new: indices of the images wanted.
+        images: working images (H, W, 3) of all members of the subset, RGB.
+        model: their sparse model.
+        keys: camera key of each image.
+        features: local features of each new image, pixels of the working image.
+        grids: (width, height) of each new image's point map.
+        partners: images that each new one is matched with, at most.
+        threads: processor threads.
+    """
+    placed = [i for i in new if i in model.local_from_cam]
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        maps = dict(
+            zip(placed, pool.map(lambda i: _depth_map(i, images, model, keys, grids[i], partners), placed), strict=True)
+        )
+        checked = pool.map(lambda i: _cross_check(i, maps, model, keys), placed)
+        maps = dict(zip(placed, list(checked), strict=True))
+    views = {}
+    for i in placed:
+        dense = _to_view(i, maps[i], model, keys)
+        sparse = sparse_view(i, model, keys, features[i], grids[i])
+        chosen = sparse.confidence > 0.0
+        views[i] = DenseView(
+            np.where(chosen[..., None], sparse.points, dense.points),
+            np.where(chosen, sparse.confidence, dense.confidence),
+        )
+    return views
+
+
+def dense_view(
+    index: int,
+    images: Mapping[int, UInt8],
+    model: SparseModel,
+    keys: Mapping[int, str],
+    grid: tuple[int, int],
+    partners: int = 2,
+) -> DenseView:
+    """Return the point map of one placed image from stereo alone; arguments as for `dense_views`."""
+    return _to_view(index, _depth_map(index, images, model, keys, grid, partners), model, keys)
+
+
+def sparse_view(
+    index: int, model: SparseModel, keys: Mapping[int, str], features: Features, grid: tuple[int, int]
+) -> DenseView:
+    """Return a point map (height, width of `grid`) that holds only the sparse points of one image's keypoints.
+
+    A point lies in the pixel its keypoint falls into, of several the one of the lowest feature index, so that a
+    keypoint has the same pixel in every subset. Points that project farther off than `CELL_MARGIN_PX` are left out.
+    """
+    width, height = grid
+    points = np.full((height, width, 3), np.nan, np.float32)
+    confidence = np.zeros((height, width), np.float32)
+    track = model.tracks[index]
+    if len(track.features) == 0:
+        return DenseView(points, confidence)
+    working = model.cameras[keys[index]]
+    camera = working.resized(width, height)
+    places = features.pixels[track.features].astype(float) * (width / working.width, height / working.height)
+    cells = np.floor(places).astype(int)
+    in_camera = model.local_from_cam[index].inverse().apply(model.points[track.points])
+    off_centre = np.abs(camera.project(in_camera) - (cells + 0.5)).max(axis=-1)
+    inside = ((cells >= 0) & (cells < grid)).all(axis=-1)
+    good = np.flatnonzero(inside & (off_centre <= 0.5 + CELL_MARGIN_PX))[::-1]  # the lowest index is written last
+    columns, rows = cells[good].T
+    points[rows, columns] = model.points[track.points[good]]
+    confidence[rows, columns] = _sparse_confidence(index, model, keys)[good]
+    return DenseView(points, confidence)
+
+
+def choose_partners(index: int, model: SparseModel, count: int) -> list[int]:
+    """Return up to `count` placed images to match with, best first.
+
+    Every sparse point of the image is worth a log-normal of the angle between the two rays that see it, less once an
+    earlier partner sees it too.
+    """
+    own = model.tracks[index].points
+    worth = np.ones(len(own))
+    values = {}
+    for other in sorted(model.local_from_cam):
+        shared = np.isin(own, model.tracks[other].points) if other != index else np.zeros(len(own), bool)
+        if np.count_nonzero(shared) >= MIN_SHARED_POINTS:
+            angle = np.degrees(_ray_angles(index, other, model, own))
+            octaves = np.log(np.maximum(angle, 0.01) / BEST_ANGLE_DEG) / ANGLE_SPREAD
+            values[other] = np.where(shared, np.exp(-0.5 * octaves**2), 0.0)
+    chosen: list[int] = []
+    while values and len(chosen) < count:
+        best = max(values, key=lambda other: (float(values[other] @ worth), -other))
+        worth = np.where(values.pop(best) > 0.1, COVERED_TWICE * worth, worth)
+        chosen.append(best)
+    return chosen
+
+
+def _ray_angles(index: int, other: int, model: SparseModel, points: Int) -> Float:
+    """Return the angles (N,) in rad between the rays of two images to sparse points (N,)."""
+    first, second = (model.points[points] - model.local_from_cam[i].translation for i in (index, other))
+    cosine = (first * second).sum(axis=-1) / (np.linalg.norm(first, axis=-1) * np.linalg.norm(second, axis=-1))
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def _depth_map(
+    index: int,
+    images: Mapping[int, UInt8],
+    model: SparseModel,
+    keys: Mapping[int, str],
+    grid: tuple[int, int],
+    partners: int,
+) -> _DepthMap:
+    camera = model.cameras[keys[index]]
+    measured = [
+        found
+        for other in choose_partners(index, model, partners)
+        if (found := _stereo_depth(index, other, images, model, keys, grid)) is not None
+    ]
+    if not measured:
+        unknown = np.full((grid[1], grid[0]), np.nan, np.float32)
+        return _DepthMap(unknown, unknown, np.zeros_like(unknown))
+    return _merge([depth for depth, _ in measured], [sigma for _, sigma in measured], camera.fx)
+
+
+def _stereo_depth(
+    index: int,
+    other: int,
+    images: Mapping[int, UInt8],
+    model: SparseModel,
+    keys: Mapping[int, str],
+    grid: tuple[int, int],
+) -> tuple[Float, Float] | None:
+    """Return depths and their standard deviations (H, W) from one pair, or None where it cannot be rectified."""
+    import cv2
+
+    left, right = model.cameras[keys[index]], model.cameras[keys[other]]
+    focal_px = min(1.0, FINER * grid[0] / left.width) * left.fx
+    points = model.points[model.tracks[index].points]
+    poses = model.local_from_cam[index], model.local_from_cam[other]
+    pair = rectify(left, poses[0], right, poses[1], points, focal_px, RANGE_MARGIN)
+    if pair is None:
+        return None
+    grey = [cv2.cvtColor(images[i], cv2.COLOR_RGB2GRAY) for i in (index, other)]
+    found, found_sigma = disparity(*pair.images(grey[0], left, grey[1], right), pair.disparities)
+    xy, z = pair.pixels(_grid_rays(left.resized(*grid)))
+    x, y = np.ascontiguousarray(xy[..., 0]), np.ascontiguousarray(xy[..., 1])
+    nearest, linear = (
+        cv2.remap(found, x, y, how, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
+        for how in (cv2.INTER_NEAREST, cv2.INTER_LINEAR)
+    )
+    sampled = np.where(np.abs(linear - nearest) < EDGE_PX, linear, nearest)
+    sigma_px = cv2.remap(found_sigma, x, y, cv2.INTER_NEAREST)
+    sigma_px = np.sqrt((SIGMA_FACTOR * sigma_px) ** 2 + np.float32(SIGMA_FLOOR_PX**2))
+    rectified_depth = pair.depth(sampled)
+    depth = rectified_depth / z
+    sigma = sigma_px * depth * rectified_depth / np.float32(pair.focal_px * pair.baseline)
+    return depth, sigma
+
+
+@lru_cache(maxsize=8)
+def _grid_rays(camera: Camera) -> Float:
+    """Return the rays (H, W, 3) float32 through all pixel centres; kept, as undoing the distortion takes long."""
+    return camera.rays(camera.pixel_centres()).astype(np.float32)
+
+
+def _merge(depths: Sequence[Float], sigmas: Sequence[Float], focal_px: float) -> _DepthMap:
+    """Join the depths of several partners: the most precise one and those that agree with it, weighted."""
+    depth = np.stack(depths)
+    sigma = np.where(np.isfinite(depth), np.stack(sigmas), np.float32(np.inf))
+    best = sigma.argmin(axis=0)[None]
+    best_depth, best_sigma = np.take_along_axis(depth, best, 0)[0], np.take_along_axis(sigma, best, 0)[0]
+    tolerance = AGREEMENT_SIGMAS * np.hypot(sigma, best_sigma) + np.float32(AGREEMENT_GSD / focal_px) * best_depth
+    agrees = np.abs(depth - best_depth) <= tolerance
+    agrees &= np.isfinite(sigma)
+    weight = np.where(agrees, sigma, np.float32(np.inf)) ** -2
+    total = weight.sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(agrees, weight * depth, np.float32(0.0)).sum(axis=0) / total
+        mean_sigma = total**-0.5
+    support, seen = agrees.sum(axis=0), np.isfinite(sigma).sum(axis=0)
+    trust = np.where(support >= 2, TRUST_AGREED, np.where(seen >= 2, TRUST_DISPUTED, TRUST_ALONE))
+    return _DepthMap(mean, mean_sigma, np.where(seen > 0, trust, 0.0).astype(np.float32))
+
+
+def _cross_check(index: int, maps: Mapping[int, _DepthMap], model: SparseModel, keys: Mapping[int, str]) -> _DepthMap:
+    """Let other views confirm a depth, or contradict it where they look through it."""
+    own = maps[index]
+    known = np.isfinite(own.depth)
+    points = _points(index, own, model, keys)[known]
+    sigma = own.sigma[known]
+    doubt_factor, trust_factor = np.ones(len(points), np.float32), np.ones(len(points), np.float32)
+    for other in _checking_views(index, maps, model):
+        theirs, camera = maps[other], model.cameras[keys[other]]
+        height, width = theirs.depth.shape
+        in_camera = model.local_from_cam[other].inverse().apply(points)
+        pixels = camera.resized(width, height).project(in_camera)
+        inside = ((pixels >= 0.0) & (pixels < (width, height))).all(axis=-1)  # False at NaN
+        columns, rows = np.where(inside[:, None], pixels, 0.0).astype(int).T
+        depth = in_camera[:, 2]
+        seen = inside & (theirs.trust[rows, columns] >= TRUST_ALONE)
+        difference = depth - theirs.depth[rows, columns]
+        tolerance = AGREEMENT_SIGMAS * np.hypot(sigma, theirs.sigma[rows, columns])
+        tolerance = tolerance + 2.0 * AGREEMENT_GSD / camera.fx * depth
+        doubt_factor[seen & (np.abs(difference) <= tolerance)] *= CONFIRMED
+        trust_factor[seen & (difference < -2.0 * tolerance)] *= CONTRADICTED
+    trust = own.trust.copy()
+    trust[known] = (1.0 - (1.0 - trust[known]) * doubt_factor) * trust_factor
+    return _DepthMap(own.depth, own.sigma, trust)
+
+
+def _checking_views(index: int, maps: Mapping[int, _DepthMap], model: SparseModel) -> list[int]:
+    """Return the views that share most sparse points."""
+    own = model.tracks[index].points
+    shared = {other: len(np.intersect1d(own, model.tracks[other].points)) for other in maps if other != index}
+    ranked = sorted((other for other in shared if shared[other]), key=lambda other: (-shared[other], other))
+    return ranked[:CHECKING_VIEWS]
+
+
+def _points(index: int, depth_map: _DepthMap, model: SparseModel, keys: Mapping[int, str]) -> Float:
+    """Return the points (H, W, 3) float32 in the local frame."""
+    height, width = depth_map.depth.shape
+    rays = _grid_rays(model.cameras[keys[index]].resized(width, height))
+    pose = model.local_from_cam[index]
+    return (depth_map.depth[..., None] * rays) @ pose.rotation.T.astype(np.float32) + pose.translation.astype(
+        np.float32
+    )
+
+
+def _to_view(index: int, depth_map: _DepthMap, model: SparseModel, keys: Mapping[int, str]) -> DenseView:
+    known = np.isfinite(depth_map.depth)
+    precision = _precision_worth(depth_map.sigma, depth_map.depth, model.cameras[keys[index]].fx)
+    confidence = np.where(known, precision * depth_map.trust, 0.0).astype(np.float32)
+    return DenseView(_points(index, depth_map, model, keys), confidence)
+
+
+def _precision_worth(sigma: Float, depth: Float, focal_px: float) -> Float:
+    """Return 1 for a perfect depth, 1/2 where its standard deviation is `SIGMA_HALF_GSD`."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(1.0 / (1.0 + (sigma * focal_px / (SIGMA_HALF_GSD * depth)) ** 2))
+
+
+def _sparse_confidence(index: int, model: SparseModel, keys: Mapping[int, str]) -> Float:
+    """Return the confidences (M,) of an image's triangulated points.
+
+    The formal depth precision from the reprojection error and all triangulation angles, times the chance that the
+    track holds no mismatch, which halves with every image beyond the first.
+    """
+    own = model.tracks[index].points
+    camera = model.cameras[keys[index]]
+    squared_sines = np.zeros(len(own))
+    for other in model.local_from_cam:
+        if other != index:
+            shared = np.isin(own, model.tracks[other].points)
+            squared_sines[shared] += np.sin(_ray_angles(index, other, model, own[shared])) ** 2
+    error_px = np.hypot(model.reprojection_px[own], KEYPOINT_SIGMA_PX)
+    with np.errstate(divide="ignore"):
+        relative_sigma = error_px / camera.fx / np.sqrt(squared_sines)
+    worth = _precision_worth(relative_sigma, np.ones(len(own)), camera.fx)
+    return np.asarray(worth * (1.0 - 0.5 ** (model.track_length[own] - 1.0)))
