@@ -29,7 +29,6 @@ class Flat(TorchBackbone):
 
     card = ModelCard(
         name="flat",
-        title="Flat",
         module="numpy",
         install="pip install numpy",
         code_licence="MIT",
@@ -196,7 +195,7 @@ def test_hub_without_its_package_names_it(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_missing_code_stops_before_anything_runs(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Flat, "card", ModelCard("flat", "", "no_such_package_0", "pip install it", "", "", "", 0.5))
+    monkeypatch.setattr(Flat, "card", ModelCard("flat", "no_such_package_0", "pip install it", "", "", "", 0.5))
     with pytest.raises(MissingDependencyError, match="no_such_package_0 missing; pip install it") as error:
         flat(weights)
     assert error.value.exit_code == 2

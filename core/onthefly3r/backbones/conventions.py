@@ -58,14 +58,19 @@ def network_image(
 ) -> NetworkImage:
     """Cut `box` (left, top, right, bottom in working pixels) out of an image and resample it to width x height.
 
-    `resample` is a filter of Pillow: LANCZOS, BICUBIC or BOX (the mean over the area).
+    `resample` is LANCZOS or BICUBIC as Pillow has them, or AREA as OpenCV has it, for whole images.
     """
-    from PIL import Image
-
     rows, columns = image.rgb.shape[:2]
     left, top, right, bottom = box or (0.0, 0.0, float(columns), float(rows))
-    pillow = Image.fromarray(np.ascontiguousarray(image.rgb))
-    resized = pillow.resize((width, height), Image.Resampling[resample], box=(left, top, right, bottom))
+    if resample == "AREA":
+        import cv2
+
+        resized = cv2.resize(image.rgb, (width, height), interpolation=cv2.INTER_AREA)
+    else:
+        from PIL import Image
+
+        pillow = Image.fromarray(np.ascontiguousarray(image.rgb))
+        resized = np.asarray(pillow.resize((width, height), Image.Resampling[resample], (left, top, right, bottom)))
     scale_x, scale_y = width / (right - left), height / (bottom - top)
     photo = image.working_from_photo
     grid_from_photo = PixelMap(
@@ -74,7 +79,7 @@ def network_image(
         scale_x * (photo.offset_x - left),
         scale_y * (photo.offset_y - top),
     )
-    return NetworkImage(np.asarray(resized), grid_from_photo)
+    return NetworkImage(np.asarray(resized, np.uint8), grid_from_photo)
 
 
 def centred_box(image: WorkingImage, aspect: float) -> tuple[float, float, float, float]:

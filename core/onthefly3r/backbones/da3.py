@@ -31,7 +31,6 @@ class DepthAnything3(TorchBackbone):
 
     card = ModelCard(
         name="da3",
-        title="Depth Anything 3",
         module="depth_anything_3",
         install="pip install --no-deps depth-anything-3==0.1.1; pip install addict einops omegaconf pyyaml",
         code_licence="Apache-2.0",
@@ -48,7 +47,7 @@ class DepthAnything3(TorchBackbone):
         rows, columns = image.rgb.shape[:2]
         scale = self.longest_px / max(rows, columns)
         width, height = (self._in_patches(round(side * scale)) for side in (columns, rows))
-        return network_image(image, width, height, "BOX" if scale < 1.0 else "BICUBIC")
+        return network_image(image, width, height, "AREA" if scale < 1.0 else "BICUBIC")
 
     def _in_patches(self, side_px: int) -> int:
         return max(1, int(side_px / self.patch_px + 0.5)) * self.patch_px

@@ -40,7 +40,6 @@ class MapAnything(TorchBackbone):
 
     card = ModelCard(
         name="mapanything",
-        title="MapAnything",
         module="mapanything",
         install="pip install git+https://github.com/facebookresearch/map-anything",
         code_licence="Apache-2.0",

@@ -33,7 +33,6 @@ class Pi3(TorchBackbone):
 
     card = ModelCard(
         name="pi3",
-        title="Pi3",
         module="pi3",
         install=INSTALL,
         code_licence="BSD-3-Clause",
@@ -74,7 +73,6 @@ class Pi3X(Pi3):
 
     card = ModelCard(
         name="pi3x",
-        title="Pi3X",
         module="pi3",
         install=INSTALL,
         code_licence="BSD-3-Clause",

@@ -41,7 +41,6 @@ class ModelCard:
     """What a user must know of a neural backbone before it runs."""
 
     name: str
-    title: str
     module: str  # the upstream package that must be importable
     install: str  # the command that installs it
     code_licence: str

@@ -39,7 +39,6 @@ class Vggt(TorchBackbone):
 
     card = ModelCard(
         name="vggt",
-        title="VGGT",
         module="vggt",
         install="pip install --no-deps git+https://github.com/facebookresearch/vggt, einops, huggingface_hub",
         code_licence="VGGT licence (Meta)",
@@ -80,7 +79,6 @@ class VggtOmega(TorchBackbone):
 
     card = ModelCard(
         name="vggt-omega",
-        title="VGGT-Omega",
         module="vggt_omega",
         install="pip install --no-deps git+https://github.com/facebookresearch/vggt-omega, einops",
         code_licence="FAIR non-commercial research licence",
