@@ -201,6 +201,15 @@ def test_missing_code_stops_before_anything_runs(weights: Path, monkeypatch: pyt
     assert error.value.exit_code == 2
 
 
+def test_upstream_code_that_lacks_a_package_of_its_own(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def build(*_: object) -> None:
+        import no_such_package_0  # noqa: F401
+
+    monkeypatch.setattr(Flat, "build", build)
+    with pytest.raises(MissingDependencyError, match="No module named 'no_such_package_0'"):
+        flat(weights).reconstruct(Subset((0,), (1,)), images(2), {})
+
+
 def test_names_of_the_paper_and_the_built_in_ones_are_known() -> None:
     expected = {"classical", "pi3", "pi3x", "vggt", "vggt-omega", "mapanything", "da3"}
     assert expected <= set(backbone_targets())

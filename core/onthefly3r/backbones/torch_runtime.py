@@ -114,8 +114,8 @@ class TorchBackbone(ABC):
         self, subset: Subset, images: Mapping[int, WorkingImage], calibrations: Mapping[str, Camera]
     ) -> LocalModel | Rejection:
         """Rebuild the subset; when GPU memory runs out, half of the new images are left out and it goes on."""
-        started_s = time.perf_counter()
         network = self._loaded()
+        started_s = time.perf_counter()
         least = 1 if subset.references else 2
         new = subset.new
         if self._most_images is not None:
@@ -146,7 +146,7 @@ class TorchBackbone(ABC):
 
     def _loaded(self) -> Any:
         if self._network is None:
-            log.info("%s: licence: %s", self.card.name, self.card.licence)
+            log.warning("%s: licence: %s", self.card.name, self.card.licence)
             self._device = select_device(self._options.device)
             limit_gpu_memory(self._device, self._options.max_gpu_memory_gib)
             if self._device.type == "cpu" and self._options.threads:
@@ -157,8 +157,13 @@ class TorchBackbone(ABC):
         return self._network
 
     def _load(self, weights: Weights) -> Any:
-        with quiet_upstream():
-            network, state = self.build(read_state(weights.path), weights.config)
+        try:
+            with quiet_upstream():
+                network, state = self.build(read_state(weights.path), weights.config)
+        except ImportError as error:
+            raise MissingDependencyError(
+                f"backbone {self.card.name}: its upstream code cannot be imported ({error}); install what it names"
+            ) from error
         load_strict(network, state, str(weights.path), self.spare_weights)
         network = network.eval().requires_grad_(False)
         try:
