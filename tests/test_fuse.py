@@ -169,6 +169,12 @@ def test_temporary_files_are_removed_also_when_cancelled(tmp_path: Path) -> None
     assert list(tmp_path.iterdir()) == []
 
 
+def test_files_of_a_killed_run_are_cleared(tmp_path: Path) -> None:
+    (tmp_path / "spill-000017.bin").write_bytes(b"left")
+    list(fuse([batch(ground(np.random.default_rng(0), 100, 5.0))], 0.1, 0.0, tmp_path, False))
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_no_points_give_no_tiles(tmp_path: Path) -> None:
     assert list(fuse([], 0.1, 0.0, tmp_path, True)) == []
     assert list(fuse([batch(np.zeros((0, 3)))], 0.1, 0.0, tmp_path, True)) == []

@@ -64,7 +64,7 @@ def import_open3d() -> Any:
     except ModuleNotFoundError as error:
         if error.name != "open3d":
             raise MissingDependencyError(f"open3d needs {error.name}: pip install 'onthefly3r[cloud]'") from None
-        raise MissingDependencyError("ICP needs open3d: pip install 'onthefly3r[cloud]'") from None
+        raise MissingDependencyError("this needs open3d: pip install 'onthefly3r[cloud]'") from None
     except (ImportError, OSError) as error:  # a shared library that the wheel does not bring
         raise MissingDependencyError(
             f"open3d does not start ({error}); on Debian and Ubuntu: {SYSTEM_LIBRARIES}"

@@ -16,7 +16,7 @@ from ..geometry.arrays import Float, Int
 from ..geometry.transforms import Sim3
 from .clouds import CloudFile
 
-MAX_QUERIES = 500_000  # points of a cloud from which distances are taken
+MAX_QUERIES = 200_000  # points of a cloud from which distances are taken: their mean is good to a few per mille
 COARSE_POINTS = 50_000  # of the target: a first bound, so that far parts of it need no search
 
 

@@ -32,7 +32,7 @@ def write_model(folder: Path, cameras: Sequence[PlacedCamera], sparse: SparsePoi
 
     IMAGE_ID is the shot index + 1; images with equal intrinsics share a camera. Numbers keep all their digits, because
     projected coordinates are large. Observations in images that are not among `cameras` are left out, and so are points
-    that no camera sees.
+    that no camera sees. Names are written whole; COLMAP itself reads a name only up to its first space.
 
     Format: https://colmap.github.io/format.html#text-format
     """

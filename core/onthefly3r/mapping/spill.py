@@ -52,6 +52,8 @@ class Spill:
 
     def __enter__(self) -> Spill:
         self._work.mkdir(parents=True, exist_ok=True)
+        for left in self._work.glob("spill-*.bin"):  # of a run that was killed
+            left.unlink()
         return self
 
     def __exit__(
