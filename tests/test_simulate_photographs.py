@@ -12,6 +12,7 @@ import pyproj
 import pytest
 from PIL import ExifTags, Image
 
+from onthefly3r.errors import Cancelled
 from onthefly3r.geometry.camera import Camera
 from onthefly3r.geometry.frames import enu_from_cam_rotation
 from onthefly3r.geometry.geodesy import EnuFrame, WorldFrame
@@ -125,6 +126,15 @@ def test_survey_leaves_complete_files_and_reports_progress(small_survey: tuple[S
     assert {path.name for path in (out / "truth").iterdir()} == truth
     assert [report.done for report in reports] == list(range(7))
     assert {(report.stage, report.total) for report in reports} == {("simulate", 6)}
+
+
+def test_cancelling_ends_the_rendering(tmp_path: Path) -> None:
+    def cancel(progress: Progress) -> None:
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        simulate_survey(tmp_path, replace(SMALL, images=40), cancel)
+    assert len(list((tmp_path / "photos").glob("*"))) < 20
 
 
 def test_true_cameras_open_in_colmap(small_survey: tuple[Survey, Path, list[Progress]]) -> None:

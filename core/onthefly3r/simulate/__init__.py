@@ -17,7 +17,8 @@ __all__ = ["Survey", "SurveyOptions", "TrueView", "plan_survey", "simulate_surve
 def simulate_survey(out: Path, options: SurveyOptions, progress: ProgressCallback | None = None) -> Survey:
     """Render a survey into out/photos/*.JPG and write its truth into out/truth/; return the survey.
 
-    The same options give the same survey. Raises `OptionError` for a plan that cannot be flown.
+    The same options give the same survey. Raises `OptionError` for a plan that cannot be flown, and whatever
+    `progress` raises, which ends the rendering early.
     """
     survey = plan_survey(options)
 
@@ -27,9 +28,13 @@ def simulate_survey(out: Path, options: SurveyOptions, progress: ProgressCallbac
     write_truth(survey, out / "truth")
     count = len(survey.views)
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        for done, _ in enumerate(pool.map(photograph, survey.views)):
-            if progress is not None:
-                progress(Progress("simulate", done, count))
+        try:
+            for done, _ in enumerate(pool.map(photograph, survey.views)):
+                if progress is not None:
+                    progress(Progress("simulate", done, count))
+        except BaseException:  # cancelled: what waits is not worth rendering
+            pool.shutdown(cancel_futures=True)
+            raise
     if progress is not None:
         progress(Progress("simulate", count, count))
     return survey

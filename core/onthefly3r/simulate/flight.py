@@ -137,7 +137,7 @@ def _camera(options: SurveyOptions) -> Camera:
     distortion = (-0.08, 0.02, 4e-4, -3e-4) if options.distorted else (0.0, 0.0, 0.0, 0.0)
     width, height = options.image_width_px, options.image_height_px
     # A real principal point is a little off the middle.
-    return Camera(width, height, focal_px, focal_px, 0.502 * width, 0.497 * height, distortion)
+    return Camera(width, height, focal_px, focal_px, 0.501 * width, 0.4985 * height, distortion)
 
 
 def _stations(options: SurveyOptions, camera: Camera) -> list[_Station]:

@@ -29,10 +29,11 @@ def render(scene: Scene, view: TrueView, supersampling: float = SUPERSAMPLING) -
 
     fine = view.camera.resized(round(view.camera.width * supersampling), round(view.camera.height * supersampling))
     footprint_m = abs(float(view.enu_from_cam.translation[2])) / fine.fx
-    pixels = fine.pixel_centres()
+    columns = np.arange(fine.width) + 0.5
     bands = []
     for top in range(0, fine.height, BAND_ROWS):  # bands fit the processor's caches
-        hits = scene.view(fine, view.enu_from_cam, pixels[top : top + BAND_ROWS])
+        rows = np.arange(top, min(top + BAND_ROWS, fine.height)) + 0.5
+        hits = scene.view(fine, view.enu_from_cam, np.stack(np.meshgrid(columns, rows), axis=-1))
         bands.append(scene.colour(hits, footprint_m))
     image = np.concatenate(bands).reshape(fine.height, fine.width, 3)
     image = cv2.resize(image, (view.camera.width, view.camera.height), interpolation=cv2.INTER_AREA)
