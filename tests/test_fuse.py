@@ -102,6 +102,7 @@ def test_confidence_grows_with_agreeing_images_not_with_repeats_of_one(tmp_path:
 
 def test_points_below_the_least_confidence_are_dropped(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
+    assert len(joined(fuse([batch(ground(rng, 9, 5.0), 0, 0.7)], 1e-3, 0.7, tmp_path, False)).points) == 9
     weak, strong = ground(rng, 50, 5.0), ground(rng, 60, 5.0) + np.array([100.0, 0.0, 0.0])
     cloud = joined(fuse([batch(weak, 0, 0.3), batch(strong, 1, 0.7)], 1e-3, 0.5, tmp_path, False))
     assert len(cloud.points) == 60

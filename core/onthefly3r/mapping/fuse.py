@@ -110,7 +110,8 @@ def _squares(spill: Spill, tile: Tile, corner: tuple[int, int], side: int, halo:
 
 def _fuse_square(square: _Square, spacing_m: float, min_confidence: float, reach: int) -> CloudTile:
     points = square.points
-    voxel = voxel_index(points["position"], spacing_m)
+    xyz = np.ascontiguousarray(points["position"].T)  # (3, N): long rows are what numpy is fast on
+    voxel = voxel_index(xyz, spacing_m)
     order, starts, views = _group(voxel, points["source"].astype(np.int64))
     sizes = np.diff(starts, append=len(points))
     group = np.empty(len(points), np.int64)  # voxel number of each point
@@ -118,28 +119,29 @@ def _fuse_square(square: _Square, spacing_m: float, min_confidence: float, reach
 
     observed = points["confidence"].astype(float)
     weight = np.bincount(group, observed)
-    origin = points["position"][:1]  # keeps the sums small: projected coordinates are large
-    offset = points["position"] - origin
-    position = np.stack([np.bincount(group, observed * offset[:, k]) for k in range(3)], axis=1) / weight[:, None]
+    origin = xyz[:, :1].copy()  # keeps the sums small: projected coordinates are large
+    xyz -= origin
+    position = np.stack([np.bincount(group, observed * row) for row in xyz], axis=1) / weight[:, None]
     rgb = np.stack([np.bincount(group, observed * points["rgb"][:, k]) for k in range(3)], axis=1) / weight[:, None]
-    mean_confidence = np.clip(weight / np.bincount(group), 0.0, 1.0)
-    confidence = 1.0 - (1.0 - mean_confidence) ** np.sqrt(views)
+    mean_confidence = np.clip(weight / sizes, 0.0, 1.0)
+    confidence = (1.0 - (1.0 - mean_confidence) ** np.sqrt(views)).astype(np.float32)
 
     in_order = observed[order]
     candidates = order[in_order == np.repeat(np.maximum.reduceat(in_order, starts), sizes)]
     strongest = np.empty(len(starts), np.int64)
-    strongest[group[candidates[::-1]]] = candidates[::-1]  # of equals the image added first stays
+    strongest[group[candidates[::-1]]] = candidates[::-1]  # of equals the image with the lowest number stays
 
-    cell = voxel[order[starts]]
-    keep = confidence >= min_confidence
+    cell = voxel[:, order[starts]]
+    keep = confidence >= np.float32(min_confidence)
     if reach:
-        keep[keep] = _has_neighbours(cell[keep], reach)
-    keep &= ((cell[:, :2] >= square.corner) & (cell[:, :2] < np.add(square.corner, square.side))).all(axis=1)
+        keep[keep] = _has_neighbours(cell[:, keep], reach)
+    for axis, first in enumerate(square.corner):  # without the halo
+        keep &= (cell[axis] >= first) & (cell[axis] < first + square.side)
     best = points[strongest[keep]]
     return CloudTile(
-        points=position[keep] + origin,
+        points=position[keep] + origin.T,
         rgb=np.rint(rgb[keep]).astype(np.uint8),
-        confidence=confidence[keep].astype(np.float32),
+        confidence=confidence[keep],
         source=best["source"],
         batch=best["batch"],
         views=views[keep].astype(np.int32),
@@ -158,12 +160,12 @@ def _group(voxel: Int, source: Int) -> tuple[Int, Int, Int]:
 
 
 def _has_neighbours(cell: Int, reach: int) -> Bool:
-    """Return which of the distinct cells (N, 3), ordered by `_key`, have enough others within `reach` on every axis."""
-    if not len(cell):
+    """Return which of the distinct cells (3, N), ordered by `_key`, have enough others within `reach` on every axis."""
+    if not cell.size:
         return np.zeros(0, bool)
     key, column_step, row_step = _key(cell, pad=reach)
-    count = np.full(len(cell), -1)  # a cell is no neighbour of its own
-    undecided = np.arange(len(cell))
+    count = np.full(cell.shape[1], -1)  # a cell is no neighbour of its own
+    undecided = np.arange(cell.shape[1])
     columns = [(dx, dy) for dx in range(-reach, reach + 1) for dy in range(-reach, reach + 1)]
     for dx, dy in sorted(columns, key=lambda step: step[0] ** 2 + step[1] ** 2):  # near ones settle most cells
         middle = key[undecided] + dx * column_step + dy * row_step
@@ -173,11 +175,11 @@ def _has_neighbours(cell: Int, reach: int) -> Bool:
 
 
 def _key(voxel: Int, pad: int) -> tuple[Int, int, int]:
-    """Return one number per voxel, ordered by (x, y, z), and its steps along x and y.
+    """Return one number per voxel of (3, N), ordered by (x, y, z), and its steps along x and y.
 
     With `pad` empty voxels on every side a step of at most `pad` never wraps round into another column.
     """
-    low = voxel.min(axis=0) - pad
-    _, ny, nz = (int(n) for n in voxel.max(axis=0) + pad - low + 1)
-    relative = voxel - low
-    return (relative[:, 0] * ny + relative[:, 1]) * nz + relative[:, 2], ny * nz, nz
+    low = voxel.min(axis=1) - pad
+    _, ny, nz = (int(n) for n in voxel.max(axis=1) + pad - low + 1)
+    x, y, z = voxel - low[:, None]
+    return (x * ny + y) * nz + z, ny * nz, nz

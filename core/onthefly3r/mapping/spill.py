@@ -137,10 +137,10 @@ class Spill:
                 with np.errstate(invalid="ignore"):  # inf - inf, already left out
                     keep &= np.abs(batch.points[:, axis] - self._centre[axis]) < reach_m
         points = np.zeros(int(np.count_nonzero(keep)), POINT)
-        points["position"], points["rgb"] = batch.points[keep], batch.rgb[keep]
-        points["confidence"], points["source"], points["batch"] = (
-            values[keep] for values in (batch.confidence, batch.source, batch.batch)
-        )
+        chosen = slice(None) if len(points) == len(keep) else keep  # mostly all, which spares a copy
+        points["position"], points["rgb"] = batch.points[chosen], batch.rgb[chosen]
+        points["confidence"], points["source"] = batch.confidence[chosen], batch.source[chosen]
+        points["batch"] = batch.batch[chosen]
         return points
 
     def _append(self, tile: Int, points: np.ndarray) -> None:
