@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import platform
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -104,7 +105,7 @@ def test_environment_whose_interpreter_changed_is_made_anew(
 
 
 def test_version_is_asked_of_the_interpreter_itself(bootstrap: ModuleType, tmp_path: Path) -> None:
-    assert bootstrap._version_of(Path(sys.executable)) == ".".join(map(str, sys.version_info[:3]))
+    assert bootstrap._version_of(Path(sys.executable)) == platform.python_version()
     assert bootstrap._version_of(tmp_path / "python") == ""
 
 

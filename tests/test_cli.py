@@ -311,14 +311,29 @@ def test_doctor_reports_crashing_and_broken_packages(tmp_path: Path, monkeypatch
 
 
 def test_view_says_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import laspy
+
     monkeypatch.setitem(sys.modules, "open3d", None)
-    (tmp_path / "cloud.laz").touch()
-    cases = [(tmp_path, "onthefly3r[cloud]"), (tmp_path / "none.laz", "does not exist")]
+    monkeypatch.setenv("DISPLAY", ":0")
+    cloud = laspy.LasData(laspy.LasHeader(version="1.4", point_format=7))
+    cloud.x = cloud.y = cloud.z = [1.0, 2.0]
+    cloud.write(tmp_path / "cloud.laz")
     (tmp_path / "empty").mkdir()
-    for path, told in [*cases, (tmp_path / "empty", "holds no cloud")]:
+    (tmp_path / "broken.las").write_text("no cloud")
+    cases = {
+        tmp_path: "onthefly3r[cloud]",
+        tmp_path / "none.laz": "no such file",
+        tmp_path / "empty": "neither cloud.laz nor cloud.las",
+        tmp_path / "broken.las": "not a LAS or LAZ file",
+    }
+    for path, told in cases.items():
         shown = call("view", path)
         assert shown.exit_code == 2
         assert told in shown.stderr
+    if sys.platform == "linux":
+        monkeypatch.delenv("DISPLAY")
+        monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+        assert "no screen" in call("view", tmp_path).stderr
 
 
 def test_refused_reconstruction_names_its_report(engine: FakeEngine, tmp_path: Path) -> None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 
 import numpy as np
 
-from .errors import InputError, MissingDependencyError
+from .errors import InputError
+from .evaluate.clouds import open_cloud
+from .evaluate.icp import import_open3d
 
 MOST_POINTS = 20_000_000
 
@@ -16,18 +20,11 @@ def view_cloud(path: Path) -> None:
 
     Raises `InputError` when there is no such cloud, or no screen, and `MissingDependencyError` without open3d.
     """
-    if path.is_dir():
-        clouds = [path / name for name in ("cloud.laz", "cloud.las") if (path / name).is_file()]
-        if not clouds:
-            raise InputError(f"{path} holds no cloud.laz or cloud.las: name a cloud or the folder of a result")
-        path = clouds[0]
-    elif not path.is_file():
-        raise InputError(f"{path} does not exist: name a cloud or the folder of a result")
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        remedy = 'install it with: pip install "onthefly3r[cloud]"; onthefly3r doctor names missing system libraries'
-        raise MissingDependencyError(f"the viewer needs open3d ({error}); {remedy}") from error
+    path = open_cloud(path).path
+    # open3d would render into an invisible window and never come back.
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise InputError("there is no screen to show the cloud on: DISPLAY and WAYLAND_DISPLAY are not set")
+    open3d = import_open3d()
     import laspy
 
     try:
