@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from .engine import Engine, Result, reconstruct
+    from .engine import Engine
+    from .run import Result, reconstruct
     from .options import Options
 
 __all__ = ["Engine", "Options", "Result", "__version__", "reconstruct"]
 
 
+_HOMES = {"Engine": "engine", "Options": "options", "Result": "run", "reconstruct": "run"}
+
+
 def __getattr__(name: str) -> Any:
-    """Import the engine on first use, so that importing the package loads nothing heavy."""
-    if name in ("Engine", "Result", "reconstruct"):
-        from . import engine
-
-        return getattr(engine, name)
-    if name == "Options":
-        from .options import Options
-
-        return Options
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    """Import what is named on first use, so that importing the package loads nothing heavy."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)

@@ -22,7 +22,7 @@ from .simulate.flight import SurveyOptions
 
 if TYPE_CHECKING:
     from .demo import Demo
-    from .engine import Result
+    from .run import Result
 
 app = typer.Typer(
     help="Georeferenced point clouds from drone photographs while they arrive.",
@@ -65,7 +65,7 @@ def run(
     with session(json_lines=json, out=out) as here:
         options = run_options(values)
         _require_folder(photos, "PHOTOS")
-        from .engine import reconstruct
+        from .run import reconstruct
 
         result = reconstruct(photos, out, options, here.progress, here.cancelled)
         for warning in result.report.get("warnings", ()):
@@ -85,7 +85,7 @@ def export(
     with session(json_lines=json, out=out) as here:
         options = run_options(values)
         _require_folder(result, "RESULT")
-        from .engine import export_again
+        from .run import export_again
 
         again = export_again(result, out, options, here.progress)
         here.reporter.result(_result_data(again), columns(_result_summary(again)))

@@ -21,7 +21,7 @@ from .options import Options
 from .protocol import ProgressCallback
 
 if TYPE_CHECKING:
-    from .engine import Result
+    from .run import Result
     from .simulate.flight import Survey, SurveyOptions
 
 CLOUD_SAMPLE = 20_000
@@ -67,7 +67,7 @@ def run_demo(
 
     Raises `InputError` when `out` holds something else, and what `reconstruct` raises.
     """
-    from .engine import reconstruct
+    from .run import reconstruct
     from .simulate import simulate_survey
     from .simulate.flight import SurveyOptions
 

@@ -199,8 +199,41 @@ class Edge:
     source: int  # submap
     target: int  # submap
     source_from_target: Sim3
-    covariance: Float  # (7, 7) [rotation, translation, log scale] right perturbation in the target frame
-    inlier_ratio: float
+    covariance: Float  # (7, 7) [rotation rad, translation, log scale], right perturbation in the target frame
+
+
+@dataclass(frozen=True)
+class FrameEdge:
+    """A measured relative pose between two frames (Eq. 15), for the paper's SE(3) graph."""
+
+    source: int  # shot index
+    target: int  # shot index
+    source_from_target: Rigid3  # translation in map units
+    sigma_rotation_rad: float
+    sigma_translation: float  # map units
+    kind: Literal["ref", "batch", "cont"]
+
+
+@dataclass(frozen=True)
+class NewFrame:
+    """An image of a local model on its way into the map: everything that is stored of it."""
+
+    frame: Frame
+    reference: CompactReference
+    points: Float  # (N, 3) float32, submap frame
+    rgb: UInt8  # (N, 3)
+    confidence: UInt8  # (N,) 0..255
+
+
+@dataclass(frozen=True)
+class Submap:
+    """One committed local model: its new frames, and its edges to the submaps of its references."""
+
+    number: int
+    map_from_submap: Sim3
+    frames: tuple[Frame, ...]
+    edges: tuple[Edge, ...]
+    frame_edges: tuple[FrameEdge, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..geometry.arrays import Bool, Float, Int, UInt8
+from ..geometry.arrays import Float, Int, UInt8
 from ..geometry.camera import Camera
 from ..records import Features
 from .local_sfm import SparseModel
@@ -24,7 +24,8 @@ BEST_ANGLE_DEG = 14.0  # between the rays of the two images: wide enough to be p
 ANGLE_SPREAD = 0.6  # standard deviation of its logarithm
 COVERED_TWICE = 0.35  # worth of a point that an earlier partner sees too
 MIN_SHARED_POINTS = 12
-RANGE_MARGIN = 0.2  # disparities searched beyond those of the sparse points, relative to their range
+CELLS = 6  # per side: where an image has cells without sparse points, something high may stand there,
+UNSEEN_RELIEF = 0.8  # at 1 / (1 + 0.8) of the distance when there are none at all
 FINER = 2.0  # stereo runs at this multiple of the point map's resolution, at most at that of the image
 
 SIGMA_FACTOR = 2.0  # true over formal standard deviation of disparities: the residuals of a window are correlated
@@ -35,7 +36,7 @@ EDGE_PX = 1.0  # disparities of neighbours farther apart are not interpolated
 SIGMA_HALF_GSD = 2.0  # depth precision at which a point is worth half
 TRUST_ALONE, TRUST_AGREED, TRUST_DISPUTED = 0.7, 0.95, 0.25
 CONFIRMED, CONTRADICTED = 0.6, 0.3  # factors of doubt and of trust for each other view that says so
-CHECKING_VIEWS = 3
+CHECKING_VIEWS = 2
 
 KEYPOINT_SIGMA_PX = 0.5
 CELL_MARGIN_PX = 0.5  # of the point map: a sparse point must project so near to the pixel of its keypoint
@@ -206,7 +207,8 @@ def _stereo_depth(
     focal_px = min(1.0, FINER * grid[0] / left.width) * left.fx
     points = model.points[model.tracks[index].points]
     poses = model.local_from_cam[index], model.local_from_cam[other]
-    pair = rectify(left, poses[0], right, poses[1], points, focal_px, RANGE_MARGIN)
+    nearer = 1.0 + UNSEEN_RELIEF * _unseen_share(poses[0].inverse().apply(points), left)
+    pair = rectify(left, poses[0], right, poses[1], points, focal_px, nearer)
     if pair is None:
         return None
     grey = [cv2.cvtColor(images[i], cv2.COLOR_RGB2GRAY) for i in (index, other)]
@@ -224,6 +226,13 @@ def _stereo_depth(
     depth = rectified_depth / z
     sigma = sigma_px * depth * rectified_depth / np.float32(pair.focal_px * pair.baseline)
     return depth, sigma
+
+
+def _unseen_share(in_camera: Float, camera: Camera) -> float:
+    """Return the share of an image's cells in which no sparse point (N, 3) lies."""
+    cells = np.floor(CELLS * camera.project(in_camera) / (camera.width, camera.height))
+    cells = cells[((cells >= 0) & (cells < CELLS)).all(axis=-1)]
+    return 1.0 - len(np.unique(cells, axis=0)) / CELLS**2
 
 
 @lru_cache(maxsize=8)

@@ -44,7 +44,6 @@ def local_sfm(
     cameras: Mapping[str, Camera],
     held: frozenset[str],
     geometries: Mapping[tuple[int, int], Any],
-    refine_focal: bool,
     threads: int,
 ) -> SparseModel | None:
     """Return the largest model of the subset, or None when no three images hold together.
@@ -55,7 +54,7 @@ def local_sfm(
 
     camera_ids = {key: number for number, key in enumerate(sorted(cameras), start=1)}
     cache = _database_cache(features, keys, cameras, camera_ids, geometries)
-    options = _pipeline_options(refine_focal, threads)
+    options = _pipeline_options(threads)
     options.constant_cameras = {camera_ids[key] for key in held if key in camera_ids}
     manager = pycolmap.ReconstructionManager()
     pycolmap.IncrementalPipeline(options, cache, manager).run()
@@ -89,9 +88,7 @@ def _database_cache(
             use_image_id=True,
         )
         frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
-        frame.add_data_id(
-            pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id), image_id)
-        )
+        frame.add_data_id(pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id), image_id))
         database.write_frame(frame, use_frame_id=True)
         database.write_keypoints(image_id, image_features.pixels)
     for (first, second), geometry in geometries.items():
@@ -102,7 +99,7 @@ def _database_cache(
     return cache
 
 
-def _pipeline_options(refine_focal: bool, threads: int) -> Any:
+def _pipeline_options(threads: int) -> Any:
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
@@ -111,7 +108,6 @@ def _pipeline_options(refine_focal: bool, threads: int) -> Any:
     options.min_model_size = MIN_MODEL_SIZE
     options.multiple_models = False
     options.extract_colors = False
-    options.ba_refine_focal_length = refine_focal
     options.mapper.abs_pose_refine_focal_length = False
     options.mapper.abs_pose_refine_extra_params = False
     return options

@@ -13,6 +13,7 @@ from ..geometry.transforms import Rigid3
 DISPARITY_STEP = 32  # SGBM wants multiples of 16, and its images are half as large as ours
 MAX_PIXELS = 4.0  # rectified over given pixels: beyond this the baseline lies too near to the viewing direction
 MAX_AXIS_COSINE = 0.8  # of the baseline to the viewing directions
+RANGE_MARGIN = 0.2  # disparities searched beyond those of the given points, relative to their range
 BORDER_SAMPLES = 32
 
 
@@ -35,7 +36,7 @@ class Rectification:
     height: int
 
     def images(self, left: UInt8, left_camera: Camera, right: UInt8, right_camera: Camera) -> tuple[UInt8, UInt8]:
-        """Return both images (height, width) without distortion, as seen by the rectified cameras."""
+        """Return both images (height, width) as the rectified cameras see them, 0 where there is no image."""
         cx, cy = self.centre
         return (
             self._remap(left, left_camera, self.rect_from_left, cx, cy),
@@ -65,7 +66,7 @@ class Rectification:
         maps = cv2.initUndistortRectifyMap(
             given, np.array(camera.distortion), rect_from_cam, wanted, (self.width, self.height), cv2.CV_16SC2
         )
-        return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR))
+        return np.asarray(cv2.remap(cv2.max(image, 1), *maps, cv2.INTER_LINEAR))
 
 
 def rectify(
@@ -75,13 +76,13 @@ def rectify(
     local_from_right: Rigid3,
     points: Float,
     focal_px: float,
-    margin: float,
+    nearer: float,
 ) -> Rectification | None:
     """Return the rectification of a pair, or None where its baseline runs too near to the viewing directions.
 
     x runs along the baseline from left to right, z along the mean viewing direction, whatever way the cameras are
     turned about it. The window is what both images can see of the depths of `points` (N, 3), local frame: robust
-    extremes, widened by `margin` times their range.
+    extremes and a margin, and surfaces that come nearer by the factor `nearer` >= 1.
     """
     baseline = local_from_right.translation - local_from_left.translation
     length = float(np.linalg.norm(baseline))
@@ -99,8 +100,8 @@ def rectify(
     if len(depths) == 0:
         return None
     low, high = np.percentile(focal_px * length / depths, [1.0, 99.0])
-    widening = margin * (high - low) + 0.02 * high
-    low, high = max(low - widening, 0.0), high + widening
+    widening = RANGE_MARGIN * (high - low) + 0.02 * high
+    low, high = max(low - widening, 0.0), max(nearer * high, high + widening)
     disparities = int(np.ceil((high - low) / DISPARITY_STEP)) * DISPARITY_STEP
 
     rect_from_left = rect_from_local @ local_from_left.rotation

@@ -11,15 +11,17 @@ UNIQUENESS_PERCENT = 5
 SPECKLE_PX, SPECKLE_RANGE = 120, 1
 CONTRAST_PX = 15  # window over which brightness and contrast are made equal
 NOISE_GREY = 3.0  # contrasts below this are noise
-WINDOW_PX = 9  # of the least squares
-STEPS = 2
+WINDOW_PX = 7  # of the least squares
+STEPS = 1
+JUMP_PX, SLOPE_PX, JUMP_SHARE = 5, 1.0, 0.1
 MAX_SHIFT_PX = 1.5  # a refinement that moves farther has left the match it started from
 
 
 def disparity(left: UInt8, right: UInt8, disparities: int) -> tuple[Float, Float]:
     """Return the disparities (H, W) float32 of the left image in px, NaN where unknown, and their standard deviations.
 
-    left, right: (H, W) of even sides, the same point in the same row, x_left - x_right from 0 to `disparities`.
+    left, right: (H, W) of even sides, 0 outside of the image; the same point lies in the same row, and
+    x_left - x_right is from 0 to `disparities`.
     Hirschmueller 2008 (OpenCV's StereoSGBM, with its left-right check); least-squares matching: Lucas & Kanade 1981.
     """
     import cv2
@@ -30,7 +32,9 @@ def disparity(left: UInt8, right: UInt8, disparities: int) -> tuple[Float, Float
     start = 2.0 * cv2.resize(coarse, left.shape[::-1], interpolation=cv2.INTER_NEAREST)
     linear = 2.0 * cv2.resize(coarse, left.shape[::-1], interpolation=cv2.INTER_LINEAR)
     smooth = np.abs(linear - start) < 1.0  # False at NaN
-    return _least_squares(left, right, np.where(smooth, linear, start))
+    found, sigma = _least_squares(left, right, np.where(smooth, linear, start))
+    jump = 2.0 * cv2.resize(_jump(coarse), left.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    return found, np.hypot(sigma, np.float32(JUMP_SHARE) * jump)
 
 
 def _semi_global(left: UInt8, right: UInt8, disparities: int) -> Float:
@@ -57,39 +61,59 @@ def _semi_global(left: UInt8, right: UInt8, disparities: int) -> Float:
     return np.asarray(found)
 
 
+def _jump(found: Float) -> Float:
+    """Return by how much the disparities about a pixel differ beyond those of a slope: it may belong to either side."""
+    import cv2
+
+    block = np.ones((JUMP_PX, JUMP_PX), np.uint8)
+    known = np.isfinite(found)
+    high = cv2.dilate(np.where(known, found, np.float32(-1e3)), block)
+    low = cv2.erode(np.where(known, found, np.float32(1e4)), block)
+    return np.where(known, np.maximum(high - low - np.float32(SLOPE_PX), np.float32(0.0)), np.float32(0.0))
+
+
 def _least_squares(left: UInt8, right: UInt8, start: Float) -> tuple[Float, Float]:
     """Shift each window of the right image along its row until it fits the left one best."""
     import cv2
 
-    first, second = _normalised(left), _normalised(right)
-    gradient = cv2.Sobel(first, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
     rows, columns = left.shape
     x = np.arange(columns, dtype=np.float32)[None, :]
     y = np.repeat(np.arange(rows, dtype=np.float32)[:, None], columns, axis=1)
-    known = np.isfinite(start)
+    known = np.isfinite(start) & (_inside(left) > 0)
+    start = np.where(known, start, np.float32(0.0))
+    known &= cv2.remap(_inside(right), x - start, y, cv2.INTER_NEAREST) > 0
     weight = known.astype(np.float32)
-    start = np.where(known, start, 0.0).astype(np.float32)
+
+    first, second = _normalised(left), _normalised(right)
+    gradient = cv2.Sobel(first, cv2.CV_32F, 1, 0, ksize=3, scale=0.125) * weight
     window = (WINDOW_PX, WINDOW_PX)
-    information = cv2.blur(gradient * gradient * weight, window) + 1e-4
+    information = np.maximum(cv2.blur(gradient * gradient, window), 1e-4)
     found = start
     for _ in range(STEPS):
-        warped = cv2.remap(second, x - found, y, cv2.INTER_LINEAR)
-        difference = (first - warped) * weight
-        found = found + cv2.blur(gradient * difference, window) / information * -1.0
-    share = cv2.blur(weight, window) + 1e-4
-    variance = cv2.blur(difference * difference, window) / share
-    sigma = np.sqrt(np.maximum(variance, 0.0) / np.maximum(information, 1e-4)) / WINDOW_PX
-    lost = ~known | (np.abs(found - start) > MAX_SHIFT_PX)
-    found[lost] = np.nan
-    return found, np.asarray(sigma, np.float32)
+        difference = first - cv2.remap(second, x - found, y, cv2.INTER_LINEAR)
+        found = found - cv2.blur(gradient * difference, window) / information
+    difference *= weight
+    share = np.maximum(cv2.blur(weight, window), 1e-4)
+    variance = np.maximum(cv2.blur(difference * difference, window), 0.0) / share
+    sigma = np.sqrt(variance / information) / WINDOW_PX
+    found[~known | (np.abs(found - start) > MAX_SHIFT_PX)] = np.nan
+    return found, sigma
+
+
+def _inside(image: UInt8) -> UInt8:
+    """Return 1 where a block about the pixel lies within the image, 0 elsewhere."""
+    import cv2
+
+    block = np.ones((2 * BLOCK_PX, 2 * BLOCK_PX), np.uint8)
+    return np.asarray(cv2.erode(cv2.min(image, 1), block, borderType=cv2.BORDER_CONSTANT, borderValue=0))
 
 
 def _normalised(image: UInt8) -> Float:
     """Return the image with local mean 0 and local contrast 1 where it has any."""
     import cv2
 
-    grey = image.astype(np.float32)
     window = (CONTRAST_PX, CONTRAST_PX)
-    mean = cv2.blur(grey, window)
-    variance = cv2.blur(grey * grey, window) - mean * mean
-    return np.asarray((grey - mean) / np.sqrt(np.maximum(variance, 0.0) + NOISE_GREY**2))
+    share = np.maximum(cv2.boxFilter(cv2.min(image, 1), cv2.CV_32F, window), np.float32(0.01))
+    mean = cv2.boxFilter(image, cv2.CV_32F, window) / share
+    variance = cv2.sqrBoxFilter(image, cv2.CV_32F, window) / share - mean * mean
+    return np.asarray((image - mean) / np.sqrt(np.maximum(variance, np.float32(0.0)) + np.float32(NOISE_GREY**2)))

@@ -28,7 +28,8 @@ class RetrievalIndex:
         row = len(self._rows)
         if row == len(self._table):
             grown = np.zeros((max(64, 2 * row), len(descriptor)), np.float32)
-            grown[:row] = self._table[:row]
+            if row:
+                grown[:row] = self._table
             self._table = grown
         self._table[row] = descriptor
         self._rows[index] = row

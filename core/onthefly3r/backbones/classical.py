@@ -1,0 +1,121 @@
+"""The classical backbone: local features, incremental structure from motion of the subset, dense stereo; no network.
+
+It stands behind the same contract as the neural models (Eq. 1): it sees only its subset, and answers in a frame
+and scale of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from ..geometry.camera import Camera, PixelMap
+from ..options import BackboneOptions
+from ..records import Features, LocalModel, LocalView, Rejection, Subset, WorkingImage
+from .base import BackboneSpec
+from .dense import dense_views, sparse_view
+from .features import FeatureStore
+from .local_sfm import SparseModel, local_sfm
+from .matching import PairMatcher
+from .selfcal import IntrinsicsPrior, self_calibrate
+
+MIN_IMAGES_TO_CALIBRATE = 8  # fewer cannot tell focal length from depth: the prior is held
+
+
+class ClassicalBackbone:
+    """RootSIFT, pycolmap's incremental mapper and rectified stereo on the processor."""
+
+    def __init__(self, options: BackboneOptions, features: FeatureStore | None = None) -> None:
+        self.spec = BackboneSpec("classical", "1", "GPL-2.0-or-later", confidence_threshold=0.5)
+        self._options = options
+        self._threads = options.threads or os.cpu_count() or 1
+        if features is None:
+            self._scratch = tempfile.TemporaryDirectory(prefix="onthefly3r-")
+            features = FeatureStore(Path(self._scratch.name), options.features)
+        self._features = features
+        self._matcher = PairMatcher(self._threads)
+
+    def features_of(self, index: int, image: WorkingImage) -> Features:
+        """Return the local features of an image, extracted on first demand; retrieval uses the same ones."""
+        return self._features.extract(index, image.rgb)
+
+    def reconstruct(
+        self, subset: Subset, images: Mapping[int, WorkingImage], calibrations: Mapping[str, Camera]
+    ) -> LocalModel | Rejection:
+        """Rebuild the subset: sparse points for all images, dense point maps for the new ones."""
+        members = subset.members
+        features = {i: self.features_of(i, images[i]) for i in members}
+        keys = {i: images[i].shot.camera_key for i in members}
+        cameras = {keys[i]: _working_camera(images[i], calibrations) for i in members}
+        geometries = self._matcher.match(features, {i: cameras[keys[i]] for i in members}, members)
+        held = frozenset(key for key in cameras if key in calibrations)
+        model = local_sfm(features, keys, cameras, held, geometries, self._threads)
+        if model is None:
+            verified = sum(len(g.inlier_matches) > 0 for g in geometries.values())
+            numbers = {"images": float(len(members)), "verified_pairs": float(verified)}
+            return Rejection(subset.new, "backbone", "too little overlap to reconstruct the subset", numbers)
+        if not held >= set(cameras) and len(model.local_from_cam) >= MIN_IMAGES_TO_CALIBRATE:
+            model = self._calibrate(model, features, keys, images, cameras, held)
+        return self._to_local_model(model, subset, images, features, keys, calibrations)
+
+    def _calibrate(
+        self,
+        model: SparseModel,
+        features: Mapping[int, Features],
+        keys: Mapping[int, str],
+        images: Mapping[int, WorkingImage],
+        cameras: Mapping[str, Camera],
+        held: frozenset[str],
+    ) -> SparseModel:
+        sigma = {keys[i]: images[i].shot.focal_ratio_sigma for i in model.local_from_cam}
+        priors = {key: IntrinsicsPrior(cameras[key], sigma[key]) for key in sigma if key not in held}
+        return self_calibrate(model, features, keys, priors, held).model
+
+    def _to_local_model(
+        self,
+        model: SparseModel,
+        subset: Subset,
+        images: Mapping[int, WorkingImage],
+        features: Mapping[int, Features],
+        keys: Mapping[int, str],
+        calibrations: Mapping[str, Camera],
+    ) -> LocalModel:
+        placed = model.local_from_cam
+        grids = {i: _grid_size(images[i], self._options.dense_px) for i in placed}
+        new = [i for i in subset.new if i in placed]
+        rgb = {i: images[i].rgb for i in placed}
+        dense = dense_views(new, rgb, model, keys, features, grids, threads=self._threads)
+        views = {}
+        for index in placed:
+            found = dense.get(index) or sparse_view(index, model, keys, features[index], grids[index])
+            width, height = grids[index]
+            shot = images[index].shot
+            views[index] = LocalView(
+                camera=model.cameras[keys[index]].resized(width, height),
+                grid_from_photo=PixelMap(width / shot.width_px, height / shot.height_px),
+                local_from_cam=placed[index],
+                points=found.points,
+                confidence=found.confidence,
+            )
+        calibrated = {
+            keys[i]: model.cameras[keys[i]].resized(images[i].shot.width_px, images[i].shot.height_px)
+            for i in placed
+            if keys[i] not in calibrations
+        }
+        notes = {"reprojection_px": model.mean_reprojection_px, "sparse_points": float(len(model.points))}
+        return LocalModel(views, calibrations=calibrated, notes=notes)
+
+
+def _working_camera(image: WorkingImage, calibrations: Mapping[str, Camera]) -> Camera:
+    height, width = image.rgb.shape[:2]
+    known = calibrations.get(image.shot.camera_key)
+    return known.resized(width, height) if known else replace(image.prior_camera, width=width, height=height)
+
+
+def _grid_size(image: WorkingImage, longest_px: int) -> tuple[int, int]:
+    height, width = image.rgb.shape[:2]
+    factor = min(1.0, longest_px / max(height, width))
+    return max(1, round(width * factor)), max(1, round(height * factor))

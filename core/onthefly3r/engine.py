@@ -1,0 +1,326 @@
+"""The online engine: images in, a validated and drift-free map out (the paper's pipeline, Sec. III)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+from .backbones.base import Backbone
+from .errors import Cancelled, PhotographError
+from .geometry.transforms import Sim3
+from .intake.cache import ImageCache
+from .mapping.frames import new_frame
+from .mapping.posegraph import PoseGraphSolver, default_solver, optimise_frames, optimise_submaps
+from .mapping.register import Registration, check_seed, frame_edges, register
+from .mapping.state import MapState
+from .mapping.store import Store
+from .options import Options
+from .protocol import Progress, ProgressCallback
+from .records import LocalModel, Rejection, Shot, Submap, Subset, WorkingImage
+from .registration.contextual import incompatible_references
+from .registration.references import scene_spacing
+from .selection.base import Describer
+from .selection.index import RetrievalIndex
+from .selection.proposals import plane_positions, propose_references
+from .selection.seed import choose_seed
+from .selection.subset import build_subset
+from .stopwatch import Stopwatch
+
+SEED_ATTEMPTS = 5
+MIN_SEED_SHARE = 0.5
+OPTIMISE_EVERY = 20  # submaps
+
+
+class Engine:
+    """Takes shots one by one or all at once, and places them in a map that only validated images may touch.
+
+    Args:
+        work: folder for chunks, journal and features.
+        options: of the whole run.
+        backbone: the local reconstructor.
+        describer: the retrieval descriptor.
+        load: decodes a shot to working size; raises `PhotographError`.
+        progress: told after every step.
+        cancel: asked before every step; true ends the run with `Cancelled`.
+    """
+
+    def __init__(
+        self,
+        work: Path,
+        options: Options,
+        backbone: Backbone,
+        describer: Describer,
+        load: Callable[[Shot], WorkingImage],
+        progress: ProgressCallback | None = None,
+        cancel: Callable[[], bool] | None = None,
+    ) -> None:
+        self.options = options
+        self.shots: dict[int, Shot] = {}
+        self.rejections: dict[int, Rejection] = {}
+        self.retries: dict[int, int] = {}
+        self.stopwatch = Stopwatch()
+        self.store = Store(work)
+        self.state = MapState(self.store)
+        self.backbone_calls = 0
+        self.batch_sizes: list[int] = []
+        self.pruned_references = 0
+        self.warnings: list[str] = []
+        self._backbone = backbone
+        self._describer = describer
+        self._images = ImageCache(self.shots, load)
+        self._progress = progress
+        self._cancel = cancel
+        self._index = RetrievalIndex()
+        self._pending: list[int] = []  # described only once there are enough to learn from
+        self._waiting: list[int] = []
+        self._set_aside: dict[int, int] = {}  # rejected image -> size of the map when it was
+        self._refused_seeds: set[int] = set()
+        self._described = False
+        self._solver: PoseGraphSolver | None = None
+
+    @property
+    def backbone_name(self) -> str:
+        """Name and version of the local reconstructor."""
+        return f"{self._backbone.spec.name} {self._backbone.spec.version}"
+
+    def details(self) -> dict[str, float]:
+        """Return figures of the run for the report."""
+        return {
+            "submaps": float(len(self.state.map_from_submap)),
+            "edges": float(len(self.state.edges)),
+            "backbone_calls": float(self.backbone_calls),
+            "mean_batch": sum(self.batch_sizes) / len(self.batch_sizes) if self.batch_sizes else 0.0,
+            "pruned_references": float(self.pruned_references),
+            "retried_images": float(sum(count > 0 for count in self.retries.values())),
+        }
+
+    # ------------------------------------------------------------------ images in
+
+    def add(self, shot: Shot) -> None:
+        """Take one more shot and go as far as the images at hand allow."""
+        self.add_all([shot])
+        self._advance(finishing=False)
+
+    def add_all(self, shots: Iterable[Shot]) -> None:
+        """Take several shots that are there already: the seed may be chosen among all of them."""
+        new = {len(self.shots) + i: shot for i, shot in enumerate(shots)}
+        self.shots.update(new)
+        threads = self.options.backbone.threads or os.cpu_count() or 1
+        with self.stopwatch.stage("features"), ThreadPoolExecutor(threads) as pool:
+            for done, (index, error) in enumerate(pool.map(self._prepare, new), start=1):
+                self._checkpoint("reading photographs", done, len(new))
+                if error is None:
+                    self._pending.append(index)
+                else:
+                    self._reject((index,), "intake", error.reason, {})
+        self._describe_pending(force=False)
+
+    def finish(self) -> None:
+        """Place what is still waiting, retry what was set aside, and remove the drift."""
+        self._describe_pending(force=True)
+        self._advance(finishing=True)
+        self._optimise()
+
+    def _prepare(self, index: int) -> tuple[int, PhotographError | None]:
+        try:
+            image = self._images[index]
+            prepare = getattr(self._backbone, "features_of", None)
+            if prepare is not None:
+                prepare(index, image)
+        except PhotographError as error:
+            return index, error
+        return index, None
+
+    def _describe_pending(self, force: bool) -> None:
+        seed_size = self.options.selection.seed_size
+        if not self._pending or (not self._described and not force and len(self._pending) < seed_size):
+            return
+        with self.stopwatch.stage("retrieval"):
+            if not self._described:
+                self._describer.fit({i: self._images[i] for i in self._pending[:seed_size]})
+                self._described = True
+            for index in self._pending:
+                self._index.add(index, self._describer.describe(index, self._images[index]))
+        self._waiting += self._pending
+        self._pending = []
+
+    # ------------------------------------------------------------------ the loop
+
+    def _advance(self, finishing: bool) -> None:
+        if not self.state.frames and not self._start(finishing):
+            return
+        while True:
+            if not self._waiting:
+                self._bring_back(finishing)
+            enough = finishing or len(self._waiting) >= self.options.selection.batch_size
+            if not self._waiting or not enough:
+                return
+            self._step()
+            self._checkpoint("reconstructing", len(self.state.frames), len(self.shots))
+
+    def _start(self, finishing: bool) -> bool:
+        """Find a seed that hangs together (Eq. 1, Eq. 3); return whether there is a map now."""
+        size = self.options.selection.seed_size
+        while self._waiting and (finishing or len(self._waiting) >= size):
+            if len(self._refused_seeds) >= SEED_ATTEMPTS and not finishing:
+                return False
+            affinity = self._index.similarities(self._waiting, self._waiting)
+            # Attempts after the first few are smaller: a small group may hang together where a large one does not.
+            wanted = size if len(self._refused_seeds) < SEED_ATTEMPTS else max(5, size // 3)
+            seed = choose_seed(self._waiting, affinity, wanted, frozenset(self._refused_seeds))
+            if len(seed) < 3 or len(self._refused_seeds) > 3 * SEED_ATTEMPTS:
+                for index in self._waiting:
+                    self._reject((index,), "seed", "no group of images hangs together", {})
+                self._waiting = []
+                return False
+            self._checkpoint("starting the map", 0, len(self.shots))
+            if self._commit_seed(seed):
+                return True
+            self._refused_seeds.add(seed[0])
+        return False
+
+    def _commit_seed(self, seed: tuple[int, ...]) -> bool:
+        subset = Subset(references=(), new=seed)
+        model = self._infer(subset)
+        if isinstance(model, Rejection):
+            return False
+        threshold = self._backbone.spec.confidence_threshold
+        refused = check_seed(model.views, threshold) if self.options.registration.validate_queries else {}
+        good = [i for i in seed if i in model.views and i not in refused]
+        spacing = scene_spacing({i: model.views[i] for i in good}, threshold)
+        if len(good) < max(3, MIN_SEED_SHARE * len(seed)) or not spacing > 0.0:
+            return False
+        self.state.set_spacing(spacing)
+        self._commit(model, Submap(0, Sim3(), (), ()), good)
+        return True
+
+    def _step(self) -> None:
+        subset = self._next_subset()
+        if len(subset.references) < self.options.registration.min_references:
+            numbers = {"references": float(len(subset.references))}
+            self._set_aside_images(Rejection(subset.new, "retrieval", "no similar images in the map", numbers))
+            return
+        outcome, model = self._reconstruct_and_register(subset)
+        if isinstance(outcome, Rejection) or model is None:
+            if isinstance(outcome, Rejection):
+                self._set_aside_images(outcome)
+            return
+        self.pruned_references += len(outcome.pruned)
+        number = self.state.next_submap()
+        previous = self.state.accepted[-1]
+        extra = frame_edges(model, outcome, previous, self.state) if self.options.pose_graph.pose_graph == "se3" else ()
+        submap = Submap(number, outcome.alignment.map_from_local, (), outcome.edges, extra)
+        self.batch_sizes.append(len(outcome.accepted))
+        self._commit(model, submap, outcome.accepted)
+        for refused in outcome.refused:
+            self._set_aside_images(refused)
+        if (number + 1) % OPTIMISE_EVERY == 0 and self.options.pose_graph.pose_graph == "sim3":
+            self._optimise()
+
+    def _next_subset(self) -> Subset:
+        with self.stopwatch.stage("retrieval"):
+            options = self.options.selection
+            window = self._waiting[: max(options.lookahead, options.batch_size)]
+            neighbours = propose_references(
+                window,
+                self.state.accepted,
+                self._index,
+                plane_positions(self.shots) if options.gps_candidates else {},
+                options.references,
+                options.gps_candidates,
+            )
+            similarity = self._index.similarities(window, window)
+            row = {index: i for i, index in enumerate(window)}
+            subset = build_subset(window, neighbours, lambda a, b: float(similarity[row[a], row[b]]), options)
+        taken = set(subset.new)
+        self._waiting = [i for i in self._waiting if i not in taken]
+        return subset
+
+    def _reconstruct_and_register(self, subset: Subset) -> tuple[Registration | Rejection, LocalModel | None]:
+        """Infer, register and validate; with context tokens, drop incompatible references and infer once more."""
+        model = self._infer(subset)
+        if isinstance(model, Rejection):
+            return model, None
+        outcome = self._register(model, subset)
+        if isinstance(outcome, Rejection) and self._backbone.spec.has_tokens:
+            minimum = self.options.registration.min_references
+            dropped = incompatible_references(subset, model.views, minimum)
+            if dropped:
+                subset = replace(subset, references=tuple(i for i in subset.references if i not in dropped))
+                again = self._infer(subset)
+                if isinstance(again, LocalModel):
+                    return self._register(again, subset), again
+        return outcome, model
+
+    def _infer(self, subset: Subset) -> LocalModel | Rejection:
+        self.backbone_calls += 1
+        with self.stopwatch.stage("backbone"):
+            return self._backbone.reconstruct(subset, self._images, self.state.calibrations)
+
+    def _register(self, model: LocalModel, subset: Subset) -> Registration | Rejection:
+        with self.stopwatch.stage("registration"):
+            threshold = self._backbone.spec.confidence_threshold
+            return register(model, subset, self.state, threshold, self.options.registration)
+
+    def _commit(self, model: LocalModel, submap: Submap, accepted: Iterable[int]) -> None:
+        with self.stopwatch.stage("map"):
+            threshold = self._backbone.spec.confidence_threshold
+            points = self.options.registration.reference_points
+            frames = [new_frame(i, submap.number, model.views[i], self._images[i], threshold, points) for i in accepted]
+            complete = replace(submap, frames=tuple(new.frame for new in frames))
+            self.state.commit(complete, frames, model.calibrations)
+        placed = {new.frame.index for new in frames}
+        self._waiting = [i for i in self._waiting if i not in placed]
+        for index in placed:
+            self.rejections.pop(index, None)
+            self._set_aside.pop(index, None)
+
+    # ------------------------------------------------------------------ rejection and retry
+
+    def _set_aside_images(self, rejection: Rejection) -> None:
+        """Keep rejected images for later: the map may grow around them."""
+        self._reject(rejection.images, rejection.stage, rejection.reason, rejection.numbers)
+        for index in rejection.images:
+            self.retries[index] = self.retries.get(index, 0) + 1
+            self._set_aside[index] = len(self.state.frames)
+
+    def _reject(self, images: tuple[int, ...], stage: str, reason: str, numbers: Mapping[str, float]) -> None:
+        for index in images:
+            self.rejections[index] = Rejection((index,), stage, reason, numbers)
+
+    def _bring_back(self, finishing: bool) -> None:
+        """Queue set-aside images again: while images arrive once the map has grown by a batch, at the end by any."""
+        growth = 1 if finishing else self.options.selection.batch_size
+        size = len(self.state.frames)
+        limit = self.options.registration.max_retries
+        ready = [i for i, then in self._set_aside.items() if size >= then + growth and self.retries[i] <= limit]
+        for index in sorted(ready, key=lambda i: (self.retries[i], i)):
+            del self._set_aside[index]
+            self._waiting.append(index)
+
+    # ------------------------------------------------------------------ drift
+
+    def _optimise(self) -> None:
+        kind = self.options.pose_graph.pose_graph
+        if kind == "none" or len(self.state.map_from_submap) < 2:
+            return
+        with self.stopwatch.stage("pose graph"):
+            self._solver = self._solver or default_solver()
+            if kind == "sim3":
+                optimise_submaps(self.state, self._solver)
+            else:
+                optimise_frames(self.state, self._solver)
+
+    def _checkpoint(self, stage: str, done: int, total: int) -> None:
+        if self._cancel is not None and self._cancel():
+            raise Cancelled("stopped on request; what was placed so far is in the work folder")
+        if self._progress is None:
+            return
+        placed, rejected = len(self.state.frames), len(self.rejections)
+        waiting = len(self.shots) - placed - rejected
+        elapsed = self.stopwatch.total_s
+        eta_s = elapsed / placed * waiting if placed and stage == "reconstructing" else None
+        self._progress(Progress(stage, done, total, placed, rejected, waiting, eta_s))

@@ -1,0 +1,124 @@
+"""The journal's values: submaps, poses, intrinsics and shots as plain JSON, and back."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..geometry.camera import Camera, PixelMap
+from ..geometry.transforms import Rigid3, Sim3
+from ..records import Attitude, Edge, Frame, FrameEdge, GpsFix, Shot, Submap
+
+
+def sim3_to_json(transform: Sim3) -> dict[str, Any]:
+    """Return scale, rotation (row major) and translation."""
+    return {
+        "scale": float(transform.scale),
+        "rotation": np.asarray(transform.rotation, float).tolist(),
+        "translation": np.asarray(transform.translation, float).tolist(),
+    }
+
+
+def sim3_from_json(value: Any) -> Sim3:
+    """Inverse of `sim3_to_json`."""
+    return Sim3(float(value["scale"]), np.array(value["rotation"], float), np.array(value["translation"], float))
+
+
+def rigid3_to_json(transform: Rigid3) -> dict[str, Any]:
+    """Return rotation (row major) and translation."""
+    return {"rotation": transform.rotation.tolist(), "translation": transform.translation.tolist()}
+
+
+def rigid3_from_json(value: Any) -> Rigid3:
+    """Inverse of `rigid3_to_json`."""
+    return Rigid3(np.array(value["rotation"], float), np.array(value["translation"], float))
+
+
+def camera_from_json(value: Any) -> Camera:
+    """Return the camera that `dataclasses.asdict` wrote."""
+    k1, k2, p1, p2 = (float(v) for v in value["distortion"])
+    sizes = int(value["width"]), int(value["height"])
+    return Camera(*sizes, *(float(value[name]) for name in ("fx", "fy", "cx", "cy")), (k1, k2, p1, p2))
+
+
+def submap_to_json(submap: Submap) -> dict[str, Any]:
+    """Return everything of a submap but its points."""
+    return {
+        "number": submap.number,
+        "map_from_submap": sim3_to_json(submap.map_from_submap),
+        "frames": [
+            {
+                "index": frame.index,
+                "submap": frame.submap,
+                "camera": asdict(frame.camera),
+                "grid_from_photo": asdict(frame.grid_from_photo),
+                "submap_from_cam": rigid3_to_json(frame.submap_from_cam),
+            }
+            for frame in submap.frames
+        ],
+        "edges": [
+            {
+                "source": edge.source,
+                "target": edge.target,
+                "source_from_target": sim3_to_json(edge.source_from_target),
+                "covariance": edge.covariance.tolist(),
+            }
+            for edge in submap.edges
+        ],
+        "frame_edges": [
+            {**asdict(edge), "source_from_target": rigid3_to_json(edge.source_from_target)}
+            for edge in submap.frame_edges
+        ],
+    }
+
+
+def submap_from_json(value: Any) -> Submap:
+    """Inverse of `submap_to_json`."""
+    frames = tuple(
+        Frame(
+            int(f["index"]),
+            int(f["submap"]),
+            camera_from_json(f["camera"]),
+            PixelMap(**{name: float(v) for name, v in f["grid_from_photo"].items()}),
+            rigid3_from_json(f["submap_from_cam"]),
+        )
+        for f in value["frames"]
+    )
+    edges = tuple(
+        Edge(
+            int(e["source"]),
+            int(e["target"]),
+            sim3_from_json(e["source_from_target"]),
+            np.array(e["covariance"], float),
+        )
+        for e in value["edges"]
+    )
+    frame_edges = tuple(
+        FrameEdge(
+            int(e["source"]),
+            int(e["target"]),
+            rigid3_from_json(e["source_from_target"]),
+            float(e["sigma_rotation_rad"]),
+            float(e["sigma_translation"]),
+            e["kind"],
+        )
+        for e in value["frame_edges"]
+    )
+    return Submap(int(value["number"]), sim3_from_json(value["map_from_submap"]), frames, edges, frame_edges)
+
+
+def shot_to_json(shot: Shot) -> dict[str, Any]:
+    """Return all of a shot, its path as text."""
+    return {**asdict(shot), "path": str(shot.path)}
+
+
+def shot_from_json(value: Any) -> Shot:
+    """Inverse of `shot_to_json`."""
+    known = dict(value)
+    gps, attitude = known.pop("gps"), known.pop("attitude")
+    known["path"] = Path(known["path"])
+    known["warnings"] = tuple(known["warnings"])
+    return Shot(**known, gps=GpsFix(**gps) if gps else None, attitude=Attitude(**attitude) if attitude else None)

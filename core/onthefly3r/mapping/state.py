@@ -1,0 +1,100 @@
+"""The map M_k: accepted frames, the submaps that predicted them, and the edges between those (Eq. 3, Eq. 14)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from ..errors import InputError
+from ..geometry.camera import Camera
+from ..geometry.transforms import Rigid3, Sim3
+from ..records import CompactReference, Edge, Frame, FrameEdge, NewFrame, Submap
+from .journal import rigid3_from_json, rigid3_to_json, sim3_from_json, sim3_to_json, submap_from_json
+from .store import Store
+
+
+class MapState:
+    """What is known of the scene; the only object that a committed batch changes.
+
+    Frames and points live in the frame of the submap that predicted them, so moving a submap (pose graph) moves
+    its cameras, its references and its cloud together.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self.frames: dict[int, Frame] = {}
+        self.map_from_submap: dict[int, Sim3] = {}
+        self.edges: list[Edge] = []
+        self.frame_edges: list[FrameEdge] = []
+        self.calibrations: dict[str, Camera] = {}
+        self.spacing = float("nan")  # l_scene, map units
+        self._moved: dict[int, Rigid3] = {}
+
+    @classmethod
+    def load(cls, store: Store) -> MapState:
+        """Return the map that a run left behind; raises `InputError` when its journal is missing or damaged."""
+        state = cls(store)
+        for kind, value in store.replay():
+            try:
+                if kind == "submap":
+                    state._take(submap_from_json(value), {})
+                elif kind == "spacing":
+                    state.spacing = float(value)
+                elif kind == "submap_poses":
+                    state.map_from_submap.update({int(k): sim3_from_json(v) for k, v in value.items()})
+                elif kind == "frame_poses":
+                    state._moved.update({int(k): rigid3_from_json(v) for k, v in value.items()})
+            except (KeyError, TypeError, ValueError) as error:
+                raise InputError(f"the journal's entry {kind!r} is damaged ({error!r}); run again") from error
+        return state
+
+    @property
+    def accepted(self) -> list[int]:
+        """A_k: shot indices in the order of their acceptance."""
+        return list(self.frames)
+
+    def next_submap(self) -> int:
+        """Return the number that the next committed batch gets."""
+        return len(self.map_from_submap)
+
+    def map_from_cam(self, index: int) -> Rigid3:
+        """Return the pose of an accepted frame in the map."""
+        if index in self._moved:
+            return self._moved[index]
+        frame = self.frames[index]
+        return self.map_from_submap[frame.submap].apply_to_pose(frame.submap_from_cam)
+
+    def reference(self, index: int) -> CompactReference:
+        """Return H_i of an accepted frame, in the frame of its submap."""
+        return self._store.reference(index)
+
+    def submap_pose_of(self, index: int) -> Sim3:
+        """Return map_from_submap of the submap that predicted a frame."""
+        return self.map_from_submap[self.frames[index].submap]
+
+    def commit(self, submap: Submap, frames: Sequence[NewFrame], calibrations: Mapping[str, Camera]) -> None:
+        """Add one validated batch (Eq. 14); it is on disk before it counts."""
+        self._store.commit(submap, frames)
+        self._take(submap, calibrations)
+
+    def set_spacing(self, spacing: float) -> None:
+        """Set l_scene once the seed is known."""
+        self.spacing = spacing
+        self._store.note("spacing", spacing)
+
+    def _take(self, submap: Submap, calibrations: Mapping[str, Camera]) -> None:
+        self.map_from_submap[submap.number] = submap.map_from_submap
+        self.frames.update({frame.index: frame for frame in submap.frames})
+        self.edges.extend(submap.edges)
+        self.frame_edges.extend(submap.frame_edges)
+        for key, camera in calibrations.items():
+            self.calibrations.setdefault(key, camera)
+
+    def move_submaps(self, map_from_submap: Mapping[int, Sim3]) -> None:
+        """Take over optimised submap poses; cameras, references and cloud follow."""
+        self.map_from_submap.update(map_from_submap)
+        self._store.note("submap_poses", {str(k): sim3_to_json(v) for k, v in map_from_submap.items()})
+
+    def move_frames(self, map_from_cam: Mapping[int, Rigid3]) -> None:
+        """Take over optimised camera poses only, as the paper's SE(3) graph does; the cloud stays."""
+        self._moved.update(map_from_cam)
+        self._store.note("frame_poses", {str(k): rigid3_to_json(v) for k, v in map_from_cam.items()})

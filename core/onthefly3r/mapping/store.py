@@ -1,0 +1,118 @@
+"""The map on disk: one chunk per committed batch, and a journal whose line makes the chunk count.
+
+A chunk is written under a temporary name and renamed; only then the journal line follows. What the journal does
+not name was never committed, so a run that is killed at any moment leaves a map that can be read.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry.arrays import Float, UInt8
+from ..records import CompactReference, NewFrame, Submap
+from .journal import submap_to_json
+
+CACHED_REFERENCES = 256  # about 40 KB each
+
+
+@dataclass(frozen=True)
+class StoredPoints:
+    """The points of one frame as they were predicted."""
+
+    index: int  # shot
+    submap: int
+    points: Float  # (N, 3) float32, submap frame
+    rgb: UInt8  # (N, 3)
+    confidence: UInt8  # (N,) 0..255
+
+
+class Store:
+    """Chunks and journal of one run; compact references are cached, points are only streamed."""
+
+    def __init__(self, work: Path) -> None:
+        self._chunks = work / "chunks"
+        self._journal = work / "journal.jsonl"
+        self._chunk_of: dict[int, int] = {}
+        self._recent: OrderedDict[int, CompactReference] = OrderedDict()
+        self._chunks.mkdir(parents=True, exist_ok=True)
+
+    def commit(self, submap: Submap, frames: Sequence[NewFrame]) -> None:
+        """Write one batch: the chunk first, then the journal line that makes it count."""
+        arrays: dict[str, Any] = {}
+        for new in frames:
+            prefix = str(new.frame.index)
+            arrays[f"{prefix}/reference_pixels"] = new.reference.pixels
+            arrays[f"{prefix}/reference_points"] = new.reference.points
+            arrays[f"{prefix}/reference_confidence"] = new.reference.confidence
+            arrays[f"{prefix}/points"] = new.points
+            arrays[f"{prefix}/rgb"] = new.rgb
+            arrays[f"{prefix}/confidence"] = new.confidence
+        path = self._chunk_path(submap.number)
+        temporary = path.with_suffix(".part.npz")
+        np.savez(temporary, **arrays)
+        os.replace(temporary, path)
+        self.note("submap", submap_to_json(submap))
+        for new in frames:
+            self._chunk_of[new.frame.index] = submap.number
+            self._remember(new.frame.index, new.reference)
+
+    def note(self, kind: str, value: Any) -> None:
+        """Append one line to the journal and wait until it is on disk."""
+        with self._journal.open("a", encoding="utf-8") as journal:
+            journal.write(json.dumps({kind: value}, ensure_ascii=False) + "\n")
+            journal.flush()
+            os.fsync(journal.fileno())
+
+    def replay(self) -> Iterator[tuple[str, Any]]:
+        """Yield the journal's lines as (kind, JSON value), oldest first; raises `InputError` for a damaged one."""
+        if not self._journal.exists():
+            raise InputError(f"{self._journal} is missing: this folder holds no map; name the output folder of a run")
+        with self._journal.open(encoding="utf-8") as journal:
+            for number, line in enumerate(journal, start=1):
+                try:
+                    ((kind, value),) = json.loads(line).items()
+                except (ValueError, AttributeError) as error:
+                    raise InputError(f"{self._journal}, line {number}: damaged ({error}); run again") from error
+                if kind == "submap":
+                    self._chunk_of.update({int(f["index"]): int(value["number"]) for f in value["frames"]})
+                yield kind, value
+
+    def reference(self, index: int) -> CompactReference:
+        """Return H_i of an accepted frame (Eq. 2), points in the frame of its submap."""
+        if index in self._recent:
+            self._recent.move_to_end(index)
+            return self._recent[index]
+        with np.load(self._chunk_path(self._chunk_of[index]), allow_pickle=False) as chunk:
+            reference = CompactReference(
+                chunk[f"{index}/reference_pixels"],
+                chunk[f"{index}/reference_points"],
+                chunk[f"{index}/reference_confidence"],
+            )
+        self._remember(index, reference)
+        return reference
+
+    def stream_points(self) -> Iterator[StoredPoints]:
+        """Yield the points of all frames, one frame in memory at a time."""
+        for index, submap in self._chunk_of.items():
+            with np.load(self._chunk_path(submap), allow_pickle=False) as chunk:
+                yield StoredPoints(
+                    index, submap, chunk[f"{index}/points"], chunk[f"{index}/rgb"], chunk[f"{index}/confidence"]
+                )
+
+    def _chunk_path(self, submap: int) -> Path:
+        return self._chunks / f"{submap:06d}.npz"
+
+    def _remember(self, index: int, reference: CompactReference) -> None:
+        self._recent[index] = reference
+        self._recent.move_to_end(index)
+        while len(self._recent) > CACHED_REFERENCES:
+            self._recent.popitem(last=False)

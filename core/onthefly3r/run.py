@@ -1,0 +1,277 @@
+"""One run from a folder of photographs to the files of the user: the entry of command line, Python and QGIS."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .backbones.base import Backbone
+from .backbones.registry import create_backbone
+from .engine import Engine
+from .errors import InputError, ReconstructionError
+from .export.atomic import write_text
+from .export.las import CloudSummary
+from .export.report import RejectedImage, RunSummary, Timing, build_report, peak_rss_mib, write_report
+from .geometry.transforms import Rigid3
+from .intake.folder import read_photographs
+from .intake.images import load_working_image
+from .mapping.georef import georeference
+from .mapping.ground import ground_normal
+from .mapping.journal import shot_from_json, shot_to_json
+from .mapping.state import MapState
+from .mapping.store import Store
+from .options import Options
+from .products import ExportFrame, write_products
+from .protocol import Progress, ProgressCallback
+from .records import GeoReference, RefusedPhotograph, Rejection, Shot
+from .selection.base import Describer
+from .selection.descriptors import VladDescriber
+from .stopwatch import Stopwatch
+
+MAX_RUN_FILE_BYTES = 256 * 1024 * 1024
+PRODUCTS = ("cloud.las", "cloud.laz", "trajectory.csv", "preview.png", "report.json")
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run made."""
+
+    report: dict[str, Any]
+    report_path: Path
+    cloud: Path | None
+    cameras: Path | None
+    placed: int
+    given: int
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """The state of affairs that the files and the report are made from."""
+
+    shots: dict[int, Shot]
+    rejections: dict[int, Rejection]
+    retries: dict[int, int]
+    refused: Sequence[RefusedPhotograph]
+    backbone: str
+    details: dict[str, Any]
+    warnings: Sequence[str]
+
+
+def reconstruct(
+    photos: Path,
+    out: Path,
+    options: Options | None = None,
+    progress: ProgressCallback | None = None,
+    cancel: Callable[[], bool] | None = None,
+) -> Result:
+    """Reconstruct a folder of photographs into `out`; same names and defaults as the command line.
+
+    Raises:
+        InputError: the folder, an option or the environment is wrong; nothing was written.
+        ReconstructionError: nothing could be reconstructed or georeferenced; the report is written.
+        Cancelled: `cancel` returned true.
+    """
+    photos, out, options = Path(photos), Path(out), options or Options()
+    stopwatch = Stopwatch()
+    with stopwatch.stage("intake"):
+        shots, refused = read_photographs(photos, options.intake)
+    backbone = create_backbone(options.backbone)
+    work = _fresh_work_folder(out)
+    engine = Engine(
+        work,
+        options,
+        backbone,
+        _describer(backbone),
+        lambda shot: load_working_image(shot, options.backbone.working_px),
+        progress,
+        cancel,
+    )
+    engine.stopwatch = stopwatch
+    engine.add_all(shots)
+    engine.finish()
+    write_text(work / "run.json", json.dumps(_run_to_json(engine, refused), ensure_ascii=False))
+    outcome = _Outcome(
+        engine.shots,
+        engine.rejections,
+        engine.retries,
+        refused,
+        engine.backbone_name,
+        engine.details(),
+        engine.warnings,
+    )
+    return _finish(out, work, engine.state, engine.store, outcome, options, stopwatch, progress, cancel)
+
+
+def export_again(
+    run: Path, out: Path, options: Options | None = None, progress: ProgressCallback | None = None
+) -> Result:
+    """Write the files of an earlier run again into `out`, with another CRS, format or spacing.
+
+    Raises `InputError` when `run` holds no map, and what `reconstruct` raises.
+    """
+    run, out, options = Path(run), Path(out), options or Options()
+    stopwatch = Stopwatch()
+    store = Store(run / "work")
+    state = MapState.load(store)
+    outcome = _read_run(run / "work" / "run.json")
+    out.mkdir(parents=True, exist_ok=True)
+    return _finish(out, out / "work", state, store, outcome, options, stopwatch, progress, None)
+
+
+def _finish(
+    out: Path,
+    work: Path,
+    state: MapState,
+    store: Store,
+    outcome: _Outcome,
+    options: Options,
+    stopwatch: Stopwatch,
+    progress: ProgressCallback | None,
+    cancel: Callable[[], bool] | None,
+) -> Result:
+    """Georeference, write the files and, whatever happens, the report."""
+    cloud: CloudSummary | None = None
+    reference: GeoReference | None = None
+    failure: ReconstructionError | None = None
+    placed, rejected = len(state.frames), len(outcome.rejections) + len(outcome.refused)
+
+    def checkpoint(stage: str, done: int, total: int) -> None:
+        from .errors import Cancelled
+
+        if cancel is not None and cancel():
+            raise Cancelled("stopped on request; what was placed so far is in the work folder")
+        if progress is not None:
+            progress(Progress(stage, done, total, placed, rejected, 0))
+
+    try:
+        if not state.frames:
+            raise ReconstructionError(
+                "no photographs could be reconstructed together: they overlap too little or show too little texture; "
+                "the report lists what each one lacked"
+            )
+        with stopwatch.stage("georeference"):
+            checkpoint("georeferencing", 0, 1)
+            up = ground_normal(state)
+            if not options.georeference.local:
+                reference = _georeference(state, outcome.shots, options, up)
+        with stopwatch.stage("export"):
+            cloud = write_products(
+                out,
+                work,
+                state,
+                store,
+                outcome.shots,
+                outcome.rejections,
+                outcome.retries,
+                reference,
+                ExportFrame.of(reference, up),
+                options,
+                out.resolve().name,
+                checkpoint,
+            )
+    except ReconstructionError as error:
+        failure = error
+    summary = RunSummary(
+        options=options,
+        backbone=outcome.backbone,
+        given=len(outcome.shots) + len(outcome.refused),
+        placed=placed,
+        rejected=_rejected(outcome),
+        timing=Timing(stopwatch.total_s, stopwatch.stages.get("backbone", 0.0), dict(stopwatch.stages)),
+        georeference=reference,
+        cloud=cloud,
+        error=str(failure) if failure else None,
+        warnings=outcome.warnings,
+        details=outcome.details,
+    )
+    report = build_report(summary, peak_rss_mib())
+    write_report(out / "report.json", report)
+    if failure is not None:
+        raise failure
+    return Result(
+        report=report,
+        report_path=out / "report.json",
+        cloud=cloud.path if cloud else None,
+        cameras=out / "cameras.shp",
+        placed=placed,
+        given=summary.given,
+    )
+
+
+def _georeference(state: MapState, shots: dict[int, Shot], options: Options, up: Any) -> GeoReference:
+    poses: dict[int, Rigid3] = {index: state.map_from_cam(index) for index in state.frames}
+    return georeference(poses, shots, options.georeference, up)
+
+
+def _describer(backbone: Backbone) -> Describer:
+    features_of = getattr(backbone, "features_of", None)
+    if features_of is None:
+        raise InputError("this backbone has no retrieval descriptor of its own yet; choose classical")
+    return VladDescriber(features_of)
+
+
+def _fresh_work_folder(out: Path) -> Path:
+    """Make OUT/work empty, and take away the products of an earlier run so that none can pass for this one's."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file; name a folder for the results")
+    work = out / "work"
+    if out.exists() and any(out.iterdir()) and not (work / "journal.jsonl").exists():
+        taken = [p.name for p in out.iterdir() if p.name not in (*PRODUCTS, "work", "colmap")]
+        if taken and not (out / "report.json").exists():
+            raise InputError(f"{out}: is not empty (it holds {taken[0]}) and no earlier result; name another folder")
+    for name in PRODUCTS:
+        (out / name).unlink(missing_ok=True)
+    if (work / "journal.jsonl").exists() or (work / "features").exists():
+        shutil.rmtree(work)
+    work.mkdir(parents=True, exist_ok=True)
+    return work
+
+
+def _rejected(outcome: _Outcome) -> list[RejectedImage]:
+    listed = [RejectedImage(r.name, "intake", r.reason, dict(r.numbers)) for r in outcome.refused]
+    for index, rejection in sorted(outcome.rejections.items()):
+        name = outcome.shots[index].name
+        listed.append(RejectedImage(name, rejection.stage, rejection.reason, dict(rejection.numbers)))
+    return listed
+
+
+def _run_to_json(engine: Engine, refused: Sequence[RefusedPhotograph]) -> dict[str, Any]:
+    return {
+        "backbone": engine.backbone_name,
+        "details": engine.details(),
+        "warnings": list(engine.warnings),
+        "shots": {str(i): shot_to_json(shot) for i, shot in engine.shots.items()},
+        "retries": {str(i): count for i, count in engine.retries.items()},
+        "rejections": {
+            str(i): {"stage": r.stage, "reason": r.reason, "numbers": dict(r.numbers)}
+            for i, r in engine.rejections.items()
+        },
+        "refused": [{"name": r.name, "reason": r.reason, "numbers": dict(r.numbers)} for r in refused],
+    }
+
+
+def _read_run(path: Path) -> _Outcome:
+    if not path.exists():
+        raise InputError(f"{path} is missing: the run did not end; run again")
+    if path.stat().st_size > MAX_RUN_FILE_BYTES:
+        raise InputError(f"{path} is larger than {MAX_RUN_FILE_BYTES} bytes and not one of ours; run again")
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        return _Outcome(
+            shots={int(i): shot_from_json(s) for i, s in stored["shots"].items()},
+            rejections={
+                int(i): Rejection((int(i),), r["stage"], r["reason"], r["numbers"])
+                for i, r in stored["rejections"].items()
+            },
+            retries={int(i): int(n) for i, n in stored["retries"].items()},
+            refused=[RefusedPhotograph(r["name"], r["reason"], r["numbers"]) for r in stored["refused"]],
+            backbone=str(stored["backbone"]),
+            details=dict(stored["details"]),
+            warnings=list(stored["warnings"]),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path} is damaged ({error!r}); run again") from error
