@@ -65,10 +65,10 @@ class FakeEngine:
 @pytest.fixture
 def engine(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeEngine]:
     fake = FakeEngine()
-    module = types.ModuleType("onthefly3r.engine")
+    module = types.ModuleType("onthefly3r.run")
     module.reconstruct = fake.reconstruct  # type: ignore[attr-defined]
     module.export_again = fake.export_again  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "onthefly3r.engine", module)
+    monkeypatch.setitem(sys.modules, "onthefly3r.run", module)
     yield fake
 
 
@@ -218,7 +218,7 @@ def test_unexpected_error_leaves_a_traceback_in_work(engine: FakeEngine, tmp_pat
 
 SLOW_ENGINE = """
 import sys, time, types
-engine = types.ModuleType("onthefly3r.engine")
+engine = types.ModuleType("onthefly3r.run")
 def reconstruct(photos, out, options, progress, cancel):
     from onthefly3r.errors import Cancelled
     from onthefly3r.protocol import Progress
@@ -232,7 +232,7 @@ def reconstruct(photos, out, options, progress, cancel):
         os.write(2, b"the engine tidied up\\n")
         raise
 engine.reconstruct = reconstruct
-sys.modules["onthefly3r.engine"] = engine
+sys.modules["onthefly3r.run"] = engine
 from onthefly3r.cli import main
 sys.argv = ["onthefly3r", *sys.argv[1:]]
 main()

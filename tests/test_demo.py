@@ -91,9 +91,9 @@ def engine(monkeypatch: pytest.MonkeyPatch) -> None:
         assert len(list(photos.glob("*.JPG"))) == SMALL.images
         return write_shifted_truth(plan_survey(SMALL), out, noise_m=0.0)
 
-    module = types.ModuleType("onthefly3r.engine")
+    module = types.ModuleType("onthefly3r.run")
     module.reconstruct = reconstruct  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "onthefly3r.engine", module)
+    monkeypatch.setitem(sys.modules, "onthefly3r.run", module)
 
 
 def test_demo_renders_reconstructs_and_measures(engine: None, tmp_path: Path) -> None:
