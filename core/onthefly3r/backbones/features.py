@@ -12,6 +12,7 @@ import numpy as np
 
 from ..geometry.arrays import UInt8
 from ..records import Features
+from .colmap import load_pycolmap
 
 CACHED_IMAGES = 128  # about 0.6 MB each
 
@@ -23,7 +24,7 @@ def extract_features(rgb: UInt8, max_features: int, extractor: Any = None) -> Fe
     doubled octave costs four times as much and adds few matches.
     """
     import cv2
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     extractor = extractor or new_extractor(max_features)
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
@@ -41,7 +42,7 @@ def extract_features(rgb: UInt8, max_features: int, extractor: Any = None) -> Fe
 
 def new_extractor(max_features: int) -> Any:
     """Return a single-threaded SIFT extractor; one per thread, as it is not safe to share."""
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False

@@ -12,6 +12,7 @@ from ..geometry.arrays import Float, Int
 from ..geometry.camera import Camera
 from ..geometry.transforms import Rigid3
 from ..records import Features
+from .colmap import load_pycolmap
 from .matching import to_pycolmap_camera
 
 MIN_MODEL_SIZE = 3
@@ -50,7 +51,7 @@ def local_sfm(
 
     Intrinsics of the camera keys in `held` stay as given; the others are refined in the bundle adjustment.
     """
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     camera_ids = {key: number for number, key in enumerate(sorted(cameras), start=1)}
     cache = _database_cache(features, keys, cameras, camera_ids, geometries)
@@ -72,7 +73,7 @@ def _database_cache(
     camera_ids: Mapping[str, int],
     geometries: Mapping[tuple[int, int], Any],
 ) -> Any:
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     database = pycolmap.Database.open(":memory:")
     for key, camera_id in camera_ids.items():
@@ -100,7 +101,7 @@ def _database_cache(
 
 
 def _pipeline_options(threads: int) -> Any:
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = threads

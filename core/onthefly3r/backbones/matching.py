@@ -13,6 +13,7 @@ import numpy as np
 from ..geometry.arrays import Float, Int
 from ..geometry.camera import Camera
 from ..records import Features
+from .colmap import load_pycolmap
 
 CACHED_PAIRS = 4000
 DESCRIPTOR_NORM = 512.0  # pycolmap stores unit RootSIFT vectors times 512 as bytes
@@ -50,7 +51,7 @@ class PairMatcher:
 
     @staticmethod
     def _match_pair(first: Features, camera1: Any, second: Features, camera2: Any) -> Any:
-        import pycolmap
+        pycolmap = load_pycolmap()
 
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.random_seed = 0
@@ -83,7 +84,7 @@ def _distance(cosine: Float) -> Float:
 
 def to_pycolmap_camera(camera: Camera, camera_id: int) -> Any:
     """Return the camera as pycolmap's OPENCV model, its focal length marked as known."""
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     made = pycolmap.Camera(
         model="OPENCV",
