@@ -18,7 +18,6 @@ from onthefly3r.records import Shot, WorkingImage
 from onthefly3r.selection import neural
 from onthefly3r.selection.neural import (
     NETWORK_SHARE,
-    CentredDescriber,
     ConcatenatedDescriber,
     EfficientNetDescriber,
     MegaLocDescriber,
@@ -130,16 +129,6 @@ def test_concatenation_weighs_similarities_by_squared_shares() -> None:
     got = both.describe(0, photograph(texture(0))) @ both.describe(1, photograph(texture(0)))
     share = NETWORK_SHARE**2
     assert got == pytest.approx((unit[0] @ unit[1] + share * (unit[2] @ unit[3])) / (1.0 + share), abs=1e-6)
-
-
-def test_centring_takes_out_what_the_first_images_share() -> None:
-    own = [(1, 0), (-1, 0), (0, 1), (0, -1)]
-    vectors = {number: np.array([10.0, *rest]) for number, rest in enumerate(own)}
-    describer = CentredDescriber(Constant(vectors))
-    image = photograph(texture(0))
-    describer.fit(dict.fromkeys(range(4), image))
-    assert describer.describe(0, image) @ describer.describe(1, image) == pytest.approx(-1.0, abs=1e-6)
-    assert describer.describe(0, image) @ describer.describe(2, image) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_strengthened_only_where_the_packages_are(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from ..networks.weights import find_weights, load_strict, read_state
 from ..records import WorkingImage
 from .base import Describer
 
-NETWORK_SHARE = 0.7  # weight of the centred network part beside local features, measured on drone surveys
+NETWORK_SHARE = 0.5  # weight beside local features: more costs precision on real surveys (docs/backbones.md)
 GEM_POWER = 3.0
 SQUARE_PX = 322
 
@@ -151,24 +151,6 @@ class SupSceneDescriber(NetworkDescriber):
         return self._network(imagenet_normalised(self._tensor(image, SQUARE_PX, SQUARE_PX, "BICUBIC")))[0]
 
 
-class CentredDescriber:
-    """A descriptor about the mean of the first images, so that what all images share does not count."""
-
-    def __init__(self, inner: Describer) -> None:
-        self._inner = inner
-        self._mean: Float | None = None
-
-    def fit(self, images: Mapping[int, WorkingImage]) -> None:
-        """Learn the mean, and what the inner descriptor learns."""
-        self._inner.fit(images)
-        self._mean = np.mean([self._inner.describe(index, image) for index, image in images.items()], axis=0)
-
-    def describe(self, index: int, image: WorkingImage) -> Float:
-        """Return the centred descriptor (D,) float32 of length 1."""
-        vector = self._inner.describe(index, image)
-        return _unit(vector if self._mean is None else vector - self._mean)
-
-
 class ConcatenatedDescriber:
     """Several descriptors side by side; a similarity is the mean of theirs weighted by the squared shares."""
 
@@ -189,8 +171,7 @@ def strengthened(describer: Describer, device: str = "auto") -> Describer:
     """Return a descriptor of local features joined by EfficientNet-Lite0 where its packages are installed."""
     if any(importlib.util.find_spec(package) is None for package in EfficientNetDescriber.packages):
         return describer
-    network = CentredDescriber(EfficientNetDescriber(device))
-    return ConcatenatedDescriber([(describer, 1.0), (network, NETWORK_SHARE)])
+    return ConcatenatedDescriber([(describer, 1.0), (EfficientNetDescriber(device), NETWORK_SHARE)])
 
 
 def _unit(vector: Float) -> Float:
