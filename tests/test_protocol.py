@@ -1,14 +1,16 @@
-"""Events survive the way through a line of text."""
+"""Events survive the way through a line of text, jobs the way through a file."""
 
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from onthefly3r.protocol import Event, Progress
+from onthefly3r.errors import InputError
+from onthefly3r.protocol import Event, Job, Progress
 
 values = st.one_of(st.none(), st.booleans(), st.integers(-(2**53), 2**53), st.text())
 names = st.text(min_size=1).filter(lambda name: name not in ("kind", "time_s"))
@@ -34,3 +36,28 @@ def test_progress_event_carries_every_count() -> None:
 def test_other_lines_are_refused(line: str) -> None:
     with pytest.raises(ValueError):
         Event.from_line(line)
+
+
+@given(
+    st.lists(st.text(alphabet=st.characters(exclude_categories=["Cs"]), min_size=1), max_size=3),
+    st.dictionaries(st.sampled_from(["crs", "limit", "local"]), st.one_of(st.none(), st.booleans(), st.integers())),
+)
+def test_job_survives_the_file(tmp_path_factory: pytest.TempPathFactory, words: list[str], options: dict) -> None:
+    path = tmp_path_factory.mktemp("job") / "job.json"
+    job = Job("run", tuple(words), options)
+    job.write(path)
+    assert Job.read(path) == job
+
+
+def test_job_becomes_the_command_line_of_its_verb() -> None:
+    options = {"crs": "EPSG:32633", "local": False, "recursive": True, "limit": None, "common_with": ["a", "b"]}
+    words = Job("run", ("-photos", "öut"), options).words()
+    expected = "run --crs=EPSG:32633 --no-local --recursive --common-with=a --common-with=b --json -- -photos öut"
+    assert words == expected.split()
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"verb": "run"}', '{"verb": "--help", "arguments": [], "options": {}}'])
+def test_job_file_of_something_else_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "job.json").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match="is not a job"):
+        Job.read(tmp_path / "job.json")

@@ -18,6 +18,7 @@ from .errors import InputError
 from .evaluate.run import CloudAlign
 from .evaluate.trajectory import Align
 from .options import check
+from .protocol import Job
 from .simulate.flight import SurveyOptions
 
 if TYPE_CHECKING:
@@ -211,6 +212,16 @@ def doctor(
             table.add_row(Text(check.status, colour), check.name, Text(check.found), Text(check.remedy))
         Console(highlight=False).print(table)
     raise typer.Exit(0 if is_fit(checks) else InputError.exit_code)
+
+
+@app.command()
+def job(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="JSON file with verb, arguments and options")],
+) -> None:
+    """Run the command that another program wrote into a file, with JSON lines as with --json."""
+    with session(json_lines=True, polite=False):
+        words = Job.read(file).words()
+    app(words, prog_name="onthefly3r")
 
 
 def main() -> None:

@@ -7,9 +7,14 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
+
+from .errors import InputError
+
+MAX_JOB_BYTES = 1024 * 1024
 
 
 @dataclass(frozen=True)
@@ -54,3 +59,46 @@ class Event:
 
 
 ProgressCallback = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A command for the core in another process: a verb of the command line, its arguments and its options.
+
+    `arguments` are positional; `options` have the names of `options.py` or of the verb, None leaves the default.
+    """
+
+    verb: str
+    arguments: tuple[str, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def words(self) -> list[str]:
+        """Return the words of the command line; the double dash lets arguments begin with a dash."""
+        words = [self.verb]
+        for name, value in self.options.items():
+            flag = name.replace("_", "-")
+            if isinstance(value, bool):
+                words.append(f"--{flag}" if value else f"--no-{flag}")
+            elif isinstance(value, list | tuple):
+                words += [f"--{flag}={item}" for item in value]
+            elif value is not None:
+                words.append(f"--{flag}={value}")
+        return [*words, "--json", "--", *self.arguments]
+
+    def write(self, path: Path) -> None:
+        """Write the job as JSON, UTF-8."""
+        path.write_text(json.dumps(asdict(self), ensure_ascii=False, indent=1), encoding="utf-8")
+
+    @classmethod
+    def read(cls, path: Path) -> Job:
+        """Read what `write` wrote; raises `InputError` for anything else."""
+        try:
+            if path.stat().st_size > MAX_JOB_BYTES:
+                raise ValueError(f"larger than {MAX_JOB_BYTES} bytes")
+            data = json.loads(path.read_text(encoding="utf-8"))
+            verb, arguments, options = data["verb"], tuple(map(str, data["arguments"])), dict(data["options"])
+            if not isinstance(verb, str) or not verb.isidentifier():
+                raise ValueError(f"{verb!r} is no verb")
+            return cls(verb, arguments, options)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path} is not a job ({error}); write it with onthefly3r.protocol.Job.write") from error
