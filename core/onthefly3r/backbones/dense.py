@@ -33,7 +33,7 @@ SIGMA_FLOOR_PX = 0.05  # of disparities, from poses and intrinsics
 AGREEMENT_SIGMAS, AGREEMENT_GSD = 3.0, 1.0
 EDGE_PX = 1.0  # disparities of neighbours farther apart are not interpolated
 
-SIGMA_HALF_GSD = 2.0  # depth precision at which a point is worth half
+SIGMA_HALF_GSD = 2.5  # depth precision at which a point is worth half
 TRUST_ALONE, TRUST_AGREED, TRUST_DISPUTED = 0.7, 0.95, 0.25
 CONFIRMED, CONTRADICTED = 0.6, 0.3  # factors of doubt and of trust for each other view that says so
 CHECKING_VIEWS = 2
@@ -262,17 +262,21 @@ def _merge(depths: Sequence[Float], sigmas: Sequence[Float], focal_px: float) ->
 
 def _cross_check(index: int, maps: Mapping[int, _DepthMap], model: SparseModel, keys: Mapping[int, str]) -> _DepthMap:
     """Let other views confirm a depth, or contradict it where they look through it."""
+    import cv2
+
     own = maps[index]
     known = np.isfinite(own.depth)
+    if not known.any():
+        return own
     points = _points(index, own, model, keys)[known]
     sigma = own.sigma[known]
     doubt_factor, trust_factor = np.ones(len(points), np.float32), np.ones(len(points), np.float32)
     for other in _checking_views(index, maps, model):
         theirs, camera = maps[other], model.cameras[keys[other]]
         height, width = theirs.depth.shape
-        in_camera = model.local_from_cam[other].inverse().apply(points)
+        in_camera = cv2.transform(points[:, None], model.local_from_cam[other].inverse().matrix()[:3])[:, 0]
         pixels = camera.resized(width, height).project(in_camera)
-        inside = ((pixels >= 0.0) & (pixels < (width, height))).all(axis=-1)  # False at NaN
+        inside = np.asarray(((pixels >= 0.0) & (pixels < (width, height))).all(axis=-1))  # False at NaN
         columns, rows = np.where(inside[:, None], pixels, 0.0).astype(int).T
         depth = in_camera[:, 2]
         seen = inside & (theirs.trust[rows, columns] >= TRUST_ALONE)
@@ -296,12 +300,12 @@ def _checking_views(index: int, maps: Mapping[int, _DepthMap], model: SparseMode
 
 def _points(index: int, depth_map: _DepthMap, model: SparseModel, keys: Mapping[int, str]) -> Float:
     """Return the points (H, W, 3) float32 in the local frame."""
+    import cv2
+
     height, width = depth_map.depth.shape
     rays = _grid_rays(model.cameras[keys[index]].resized(width, height))
-    pose = model.local_from_cam[index]
-    return (depth_map.depth[..., None] * rays) @ pose.rotation.T.astype(np.float32) + pose.translation.astype(
-        np.float32
-    )
+    # Not a matrix product: BLAS would start threads for three columns, and waiting for them costs more.
+    return np.asarray(cv2.transform(depth_map.depth[..., None] * rays, model.local_from_cam[index].matrix()[:3]))
 
 
 def _to_view(index: int, depth_map: _DepthMap, model: SparseModel, keys: Mapping[int, str]) -> DenseView:

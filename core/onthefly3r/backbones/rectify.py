@@ -44,18 +44,21 @@ class Rectification:
         )
 
     def pixels(self, rays: Float) -> tuple[Float, Float]:
-        """Return x, y (...,) float32 in the left rectified image and z, the rectified depth at unit depth of `rays`.
+        """Return where rays (H, W, 3) of the left camera pierce the left rectified image, and z of the turned rays.
 
-        rays: (..., 3) in the left camera's frame; the result is (pixels (..., 2), z (...,)).
+        The result is (pixels (H, W, 2), z (H, W)); the point at depth t along a ray has the rectified depth t * z.
         """
-        turned = rays @ self.rect_from_left.T.astype(rays.dtype)
+        import cv2
+
+        turned = cv2.transform(rays, self.rect_from_left)
         z = turned[..., 2]
         xy = turned[..., :2] * (np.float32(self.focal_px) / z)[..., None] + np.asarray(self.centre, rays.dtype)
         return xy, z
 
     def depth(self, disparity: Float) -> Float:
-        """Return the rectified depth of disparities, local units."""
-        return np.asarray(np.float32(self.focal_px * self.baseline) / (disparity + np.float32(self.offset_px)))
+        """Return the rectified depths of disparities, local units; NaN beyond infinity."""
+        total = disparity + np.float32(self.offset_px)
+        return np.float32(self.focal_px * self.baseline) / np.where(total > 0.0, total, np.float32(np.nan))
 
     def _remap(self, image: UInt8, camera: Camera, rect_from_cam: Float, cx: float, cy: float) -> UInt8:
         import cv2

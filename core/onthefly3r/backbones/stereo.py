@@ -11,9 +11,10 @@ UNIQUENESS_PERCENT = 5
 SPECKLE_PX, SPECKLE_RANGE = 120, 1
 CONTRAST_PX = 15  # window over which brightness and contrast are made equal
 NOISE_GREY = 3.0  # contrasts below this are noise
-WINDOW_PX = 7  # of the least squares
-STEPS = 1
-JUMP_PX, SLOPE_PX, JUMP_SHARE = 5, 1.0, 0.1
+WINDOW_PX = 9  # of the least squares
+JUMP_PX = 5  # window at half size in which a jump of the disparity makes a pixel doubtful,
+SLOPE_PX = 1.0  # where it is larger than this,
+JUMP_SHARE = 0.1  # by this part of it
 MAX_SHIFT_PX = 1.5  # a refinement that moves farther has left the match it started from
 
 
@@ -40,7 +41,7 @@ def disparity(left: UInt8, right: UInt8, disparities: int) -> tuple[Float, Float
 def _semi_global(left: UInt8, right: UInt8, disparities: int) -> Float:
     import cv2
 
-    matcher = cv2.StereoSGBM_create(
+    matcher = cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=disparities,
         blockSize=BLOCK_PX,
@@ -88,16 +89,14 @@ def _least_squares(left: UInt8, right: UInt8, start: Float) -> tuple[Float, Floa
     gradient = cv2.Sobel(first, cv2.CV_32F, 1, 0, ksize=3, scale=0.125) * weight
     window = (WINDOW_PX, WINDOW_PX)
     information = np.maximum(cv2.blur(gradient * gradient, window), 1e-4)
-    found = start
-    for _ in range(STEPS):
-        difference = first - cv2.remap(second, x - found, y, cv2.INTER_LINEAR)
-        found = found - cv2.blur(gradient * difference, window) / information
-    difference *= weight
-    share = np.maximum(cv2.blur(weight, window), 1e-4)
-    variance = np.maximum(cv2.blur(difference * difference, window), 0.0) / share
+    # One step is enough from the start that semi-global matching gives; a second one gains nothing.
+    difference = (first - cv2.remap(second, x - start, y, cv2.INTER_LINEAR)) * weight
+    shift = cv2.blur(gradient * difference, window) / information
+    residual = cv2.blur(difference * difference, window) - shift * shift * information  # after the shift
+    variance = np.maximum(residual, np.float32(0.0)) / np.maximum(cv2.blur(weight, window), np.float32(1e-4))
     sigma = np.sqrt(variance / information) / WINDOW_PX
-    found[~known | (np.abs(found - start) > MAX_SHIFT_PX)] = np.nan
-    return found, sigma
+    lost = ~known | (np.abs(shift) > MAX_SHIFT_PX)
+    return np.where(lost, np.float32(np.nan), start - shift), sigma
 
 
 def _inside(image: UInt8) -> UInt8:
