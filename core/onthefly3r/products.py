@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .export.colmap import SparsePoints, write_model
+from .export.footprints import Footprint, footprint, with_overlap, write_footprints
 from .export.las import CloudSummary, las_scale_m, write_cloud
 from .export.preview import write_preview
 from .export.rows import CameraRow, placed_row, rejected_row
@@ -100,6 +101,7 @@ def write_products(
     for other in {"cloud.las", "cloud.laz"} - {name}:
         (out / other).unlink(missing_ok=True)
     write_cameras(out / "cameras.shp", rows, reference.crs if reference else None)
+    write_footprints(out / "footprints.shp", footprints(cameras, state, frame), reference.crs if reference else None)
     write_trajectory(out / "trajectory.csv", rows)
     write_model(out / "colmap", cameras, _sparse_points(state, frame))
     write_preview(out / "preview.png", cloud, rows, title, georeferenced=reference is not None)
@@ -124,6 +126,16 @@ def placed_cameras(
             )
         )
     return placed
+
+
+def footprints(cameras: list[PlacedCamera], state: MapState, frame: ExportFrame) -> list[Footprint]:
+    """Return what the cameras cover, each on the plane at the median height of the points that it sees."""
+    found = []
+    for camera in cameras:
+        points = state.submap_pose_of(camera.index).apply(state.reference(camera.index).points.astype(float))
+        if len(points):
+            found.append(footprint(camera, float(np.median(frame.points(points)[:, 2]))))
+    return with_overlap([item for item in found if item is not None])
 
 
 def camera_rows(

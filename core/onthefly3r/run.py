@@ -15,6 +15,7 @@ from .engine import Engine
 from .errors import InputError, ReconstructionError
 from .export.atomic import write_text
 from .export.las import CloudSummary
+from .export.page import write_page
 from .export.report import RejectedImage, RunSummary, Timing, build_report, peak_rss_mib, write_report
 from .geometry.transforms import Rigid3
 from .intake.folder import read_photographs
@@ -33,7 +34,7 @@ from .selection.descriptors import VladDescriber
 from .stopwatch import Stopwatch
 
 MAX_RUN_FILE_BYTES = 256 * 1024 * 1024
-PRODUCTS = ("cloud.las", "cloud.laz", "trajectory.csv", "preview.png", "report.json")
+PRODUCTS = ("cloud.las", "cloud.laz", "trajectory.csv", "preview.png", "report.json", "report.html")
 
 
 @dataclass(frozen=True)
@@ -190,6 +191,7 @@ def _finish(
     )
     report = build_report(summary, peak_rss_mib())
     write_report(out / "report.json", report)
+    write_page(out / "report.html", report, out.resolve().name)
     if failure is not None:
         raise failure
     return Result(

@@ -70,11 +70,12 @@ def write_cameras(path: Path, rows: Iterable[CameraRow], crs: str | None) -> int
         if crs is None:
             path.with_suffix(".prj").unlink(missing_ok=True)
         else:
-            temporary.with_suffix(".prj").write_text(_esri_wkt(crs), encoding="utf-8")
+            temporary.with_suffix(".prj").write_text(esri_wkt(crs), encoding="utf-8")
     return count
 
 
-def _esri_wkt(crs: str) -> str:
+def esri_wkt(crs: str) -> str:
+    """Return what a .prj holds: ESRI WKT 1 of the horizontal part."""
     from pyproj import CRS
 
     return str(CRS.from_user_input(crs).to_2d().to_wkt("WKT1_ESRI"))

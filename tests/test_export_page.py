@@ -1,0 +1,53 @@
+"""The report page: what it says, and that names of photographs cannot put anything into it."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+
+from onthefly3r.export.page import page
+from onthefly3r.export.report import RejectedImage, RunSummary, Timing, build_report
+from onthefly3r.options import Options
+
+
+class Words(HTMLParser):
+    """Collects text and tags, and notices what is left open."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.text: list[str] = []
+        self.tags: list[str] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        self.tags.append(tag)
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+def test_page_tells_rejections_and_escapes_names() -> None:
+    bad = RejectedImage("<script>x</script>.jpg", "retrieval", "no similar photograph & nothing near")
+    report = build_report(RunSummary(Options(), "classical 1", 3, 2, [bad], Timing(4.0, 1.0), warnings=["<b>!"]), None)
+    words = Words()
+    words.feed(page(report, "flight <1>", preview=False))
+    text = " ".join(words.text)
+    assert not words.open
+    assert "script" not in words.tags
+    assert "b" not in words.tags
+    assert "2 of 3" in text
+    assert bad.image in text
+    assert bad.reason in text
+    assert "No placed photograph looks alike" in text
+
+
+def test_page_of_a_failed_run_says_why() -> None:
+    report = build_report(
+        RunSummary(Options(), "classical 1", 3, 0, [], Timing(4.0, 1.0), error="nothing overlaps"), None
+    )
+    assert "nothing overlaps" in page(report, "flight", preview=True)
+    assert "<img" not in page(report, "flight", preview=True)
