@@ -41,7 +41,7 @@ def weighted_similarity(source: Float, target: Float, weight: Float, *, with_sca
     share = weight / weight.sum()
     source_mean, target_mean = share @ source, share @ target
     source_centred, target_centred = source - source_mean, target - target_mean
-    covariance = (target_centred * share[:, None]).T @ source_centred
+    covariance = np.einsum("ni,nj->ij", target_centred * share[:, None], source_centred)
     u, singular, vt = np.linalg.svd(covariance)
     if singular[0] <= 0.0 or singular[1] <= MIN_SINGULAR_RATIO * singular[0]:
         raise ValueError("the points lie at one place or on one line; the rotation is not determined")
