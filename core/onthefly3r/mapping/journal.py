@@ -40,8 +40,8 @@ def rigid3_from_json(value: Any) -> Rigid3:
 def camera_from_json(value: Any) -> Camera:
     """Return the camera that `dataclasses.asdict` wrote."""
     k1, k2, p1, p2 = (float(v) for v in value["distortion"])
-    sizes = int(value["width"]), int(value["height"])
-    return Camera(*sizes, *(float(value[name]) for name in ("fx", "fy", "cx", "cy")), (k1, k2, p1, p2))
+    fx, fy, cx, cy = (float(value[name]) for name in ("fx", "fy", "cx", "cy"))
+    return Camera(int(value["width"]), int(value["height"]), fx, fy, cx, cy, (k1, k2, p1, p2))
 
 
 def submap_to_json(submap: Submap) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,8 +93,9 @@ def register(
 def check_seed(views: Mapping[int, LocalView], min_confidence: float) -> dict[int, Rejection]:
     """Return the views of a first model that contradict the rest: their depth against all other views' points."""
     rejected = {}
+    samples = {i: _sample(view, min_confidence, seed=i) for i, view in views.items()}
     for index, view in views.items():
-        others = [_sample(v, min_confidence, seed=i) for i, v in views.items() if i != index]
+        others = [points for i, points in samples.items() if i != index]
         points = np.vstack(others) if others else np.zeros((0, 3))
         verdict = validate_query(index, view, Sim3(), points, min_confidence)
         if not verdict.passed:

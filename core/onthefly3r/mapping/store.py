@@ -59,7 +59,7 @@ class Store:
         path = self._chunk_path(submap.number)
         temporary = path.with_suffix(".part.npz")
         np.savez(temporary, **arrays)
-        os.replace(temporary, path)
+        temporary.replace(path)
         self.note("submap", submap_to_json(submap))
         for new in frames:
             self._chunk_of[new.frame.index] = submap.number

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from ..geometry.arrays import Float
-from ..geometry.transforms import Sim3, skew
+from ..geometry.transforms import skew
 from ..geometry.umeyama import weighted_similarity
 from ..records import Alignment, Correspondences, Rejection
 
 MIN_POINTS = 12
 MAX_ITERATIONS = 20
+SETTLED = 1e-3  # iterations end when no point moves by more than so many robust standard deviations
 HUBER = 1.345  # in robust standard deviations: 95 % efficiency on Gaussian residuals
 INLIER = 3.0  # in robust standard deviations
 # Points of one image err together (its pose, its depth scale): an image counts as so many independent points.
@@ -25,37 +26,32 @@ def align(pairs: Correspondences, images: tuple[int, ...] = ()) -> Alignment | R
     """
     if len(pairs.weight) < MIN_POINTS:
         return Rejection(images, "alignment", "too few corresponding points", {"points": float(len(pairs.weight))})
-    weight = pairs.weight
+    rounding = 1e-12 * float(np.abs(pairs.map).max())  # residuals below it are no measure of anything
     try:
-        map_from_local = weighted_similarity(pairs.local, pairs.map, weight)
+        map_from_local = weighted_similarity(pairs.local, pairs.map, pairs.weight)
+        placed = map_from_local.apply(pairs.local)
         for _ in range(MAX_ITERATIONS):
-            distance = _residual(map_from_local, pairs)
-            spread = _spread(distance)
-            kappa = HUBER * max(spread, 1e-12)
-            huber = np.minimum(1.0, kappa / np.maximum(distance, 1e-300))
-            updated = weighted_similarity(pairs.local, pairs.map, weight * huber)
-            change = np.abs(updated.matrix() - map_from_local.matrix()).max() / updated.scale
-            map_from_local = updated
-            if change < 1e-9:
+            distance = np.linalg.norm(placed - pairs.map, axis=1)
+            spread = max(_spread(distance), rounding)
+            huber = np.minimum(1.0, HUBER * spread / np.maximum(distance, rounding))
+            map_from_local = weighted_similarity(pairs.local, pairs.map, pairs.weight * huber)
+            before, placed = placed, map_from_local.apply(pairs.local)
+            if np.abs(placed - before).max() <= SETTLED * spread:
                 break
     except ValueError as degenerate:
         return Rejection(images, "alignment", f"degenerate correspondences: {degenerate}")
-    distance = _residual(map_from_local, pairs)
-    spread = _spread(distance)
-    inlier = distance <= INLIER * max(spread, 1e-12)
+    distance = np.linalg.norm(placed - pairs.map, axis=1)
+    spread = max(_spread(distance), rounding)
+    inlier = distance <= INLIER * spread
     references = tuple(int(i) for i in np.unique(pairs.reference))
     return Alignment(
         map_from_local=map_from_local,
         covariance=_covariance(pairs.local[inlier], spread / map_from_local.scale, len(references)),
         inlier_ratio=float(inlier.mean()),
-        residual=float(spread),
+        residual=spread,
         n_points=len(distance),
         references=references,
     )
-
-
-def _residual(map_from_local: Sim3, pairs: Correspondences) -> Float:
-    return np.asarray(np.linalg.norm(map_from_local.apply(pairs.local) - pairs.map, axis=1))
 
 
 def _spread(distance: Float) -> float:
@@ -66,16 +62,20 @@ def _spread(distance: Float) -> float:
 def _covariance(points: Float, sigma: float, n_references: int) -> Float:
     """Covariance (7, 7) of [rotation, translation, log scale], a right perturbation in the local frame.
 
-    A small change moves a local point p by w x p + u + lambda p, so its Jacobian is [-[p]x, I, p].
+    A small change moves a local point p by w x p + u + lambda p, so its Jacobian is [-[p]x, I, p]. The sums are
+    taken about the middle of the points and in units of their extent, where they are well conditioned.
     """
-    information = np.zeros((7, 7))
-    for start in range(0, len(points), 4096):
-        block = points[start : start + 4096]
-        jacobian = np.zeros((len(block), 3, 7))
-        jacobian[:, :, :3] = -np.array([skew(p) for p in block])
-        jacobian[:, :, 3:6] = np.eye(3)
-        jacobian[:, :, 6] = block
-        information += np.einsum("nij,nik->jk", jacobian, jacobian)
-    independent = INDEPENDENT_POINTS_PER_REFERENCE * max(n_references, 1)
-    share = min(1.0, independent / max(len(points), 1))
-    return np.asarray(sigma**2 * np.linalg.pinv(information * share, hermitian=True))
+    middle = points.mean(axis=0)
+    centred = points - middle
+    extent = float(np.sqrt((centred**2).sum(axis=1).mean()))
+    moment = np.einsum("ni,nj->ij", centred, centred) / (len(points) * extent**2)
+    information = np.eye(7)
+    information[:3, :3] = np.eye(3) - moment
+    independent = min(len(points), INDEPENDENT_POINTS_PER_REFERENCE * n_references)
+    about_middle = np.linalg.pinv(independent * information, hermitian=True) * (sigma / extent) ** 2
+    # u = extent u' - w x middle - lambda middle: the same motion seen from the origin of the local frame.
+    to_origin = np.eye(7)
+    to_origin[3:6, 3:6] *= extent
+    to_origin[3:6, :3] = skew(middle)
+    to_origin[3:6, 6] = -middle
+    return np.asarray(to_origin @ about_middle @ to_origin.T)

@@ -31,7 +31,7 @@ def prune_references(
     whose median disagreement is largest goes first.
     """
     remaining = tuple(int(i) for i in np.unique(pairs.reference))
-    disagreement = _disagreement(model, pairs, map_from_cam, remaining)
+    disagreement: dict[tuple[int, int], float] = {}
     verdict: ReferenceVerdict | None = None
     while len(remaining) >= max(min_references, 1):
         alignment = align(only(pairs, remaining))
@@ -40,6 +40,7 @@ def prune_references(
         verdict = validate(alignment)
         if verdict.passed:
             return alignment, verdict
+        disagreement = disagreement or _disagreement(model, pairs, map_from_cam, remaining)
         remaining = _without_worst(remaining, disagreement)
     numbers = {"references": float(len(np.unique(pairs.reference)))}
     if verdict is not None:

@@ -6,11 +6,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..geometry.arrays import Float
+from ..geometry.arrays import Float, Int
 from ..geometry.transforms import Sim3
 from ..records import CompactReference, Correspondences, LocalModel, LocalView
 
 CELLS_ACROSS = 16
+# More points of one image repeat its errors and cost time.
+MAX_PAIRS_PER_REFERENCE = 500
 
 
 def compact_reference(view: LocalView, max_points: int, min_confidence: float) -> CompactReference:
@@ -55,14 +57,23 @@ def correspond(
             continue
         columns, rows = reference.pixels[:, 0], reference.pixels[:, 1]
         points, confidence = view.points[rows, columns].astype(float), view.confidence[rows, columns].astype(float)
-        valid = (confidence >= min_confidence) & np.isfinite(points).all(axis=-1)
+        valid = spread_sample(
+            np.flatnonzero((confidence >= min_confidence) & np.isfinite(points).all(axis=-1)), MAX_PAIRS_PER_REFERENCE
+        )
         local.append(points[valid])
         mapped.append(map_from_submap[index].apply(reference.points[valid].astype(float)))
         weight.append(np.sqrt(confidence[valid] * reference.confidence[valid]))  # w = sqrt(c_local c_global), Eq. 10
-        source.append(np.full(int(valid.sum()), index))
+        source.append(np.full(len(valid), index))
     if not local:
         return Correspondences(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, int))
     return Correspondences(np.vstack(local), np.vstack(mapped), np.concatenate(weight), np.concatenate(source))
+
+
+def spread_sample(items: Int, count: int) -> Int:
+    """Return at most `count` of the items at even steps: of points ordered by cell, some of every part of the image."""
+    if len(items) <= count:
+        return items
+    return np.asarray(items[np.linspace(0, len(items) - 1, count).astype(int)])
 
 
 def scene_spacing(views: Mapping[int, LocalView], min_confidence: float) -> float:

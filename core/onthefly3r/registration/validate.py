@@ -11,6 +11,7 @@ from ..geometry.arrays import Float
 from ..geometry.transforms import Rigid3, Sim3, rotation_angle_deg
 from ..options import RegistrationOptions
 from ..records import Alignment, CompactReference, LocalModel, LocalView
+from .references import MAX_PAIRS_PER_REFERENCE, spread_sample
 
 MIN_OVERLAP_POINTS = 15
 DEPTH_TOLERANCE = 0.06  # relative; terrain steps and occlusions exceed it, so only a share must agree
@@ -147,8 +148,8 @@ def _predicted_depth(view: LocalView, cam_points: Float, min_confidence: float) 
     """Depth (N,) that the view's point map has where points in its camera frame project, NaN where nothing is known."""
     pixels = view.camera.project(cam_points)
     height, width = view.confidence.shape
-    inside = np.isfinite(pixels).all(axis=-1)
-    inside[inside] &= ((pixels[inside] >= 0) & (pixels[inside] < (width, height))).all(axis=-1)
+    # Comparisons with the NaN of points behind the camera are false.
+    inside = np.flatnonzero(((pixels >= 0) & (pixels < (width, height))).all(axis=-1))
     columns, rows = pixels[inside].astype(int).T
     trusted = view.confidence[rows, columns] >= min_confidence
     own = view.local_from_cam.inverse().apply(view.points[rows, columns].astype(float))[:, 2]
@@ -158,6 +159,9 @@ def _predicted_depth(view: LocalView, cam_points: Float, min_confidence: float) 
 
 
 def reference_points_in_map(references: Mapping[int, CompactReference], map_from_submap: Mapping[int, Sim3]) -> Float:
-    """Return the stored points (N, 3) of some references in the map frame."""
-    parts = [map_from_submap[i].apply(r.points.astype(float)) for i, r in references.items() if len(r.points)]
+    """Return stored points (N, 3) of some references in the map frame, at most `MAX_PAIRS_PER_REFERENCE` of each."""
+    parts = []
+    for index, reference in references.items():
+        kept = spread_sample(np.arange(len(reference.points)), MAX_PAIRS_PER_REFERENCE)
+        parts.append(map_from_submap[index].apply(reference.points[kept].astype(float)))
     return np.vstack(parts) if parts else np.zeros((0, 3))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from ..geometry.arrays import Float
+from ..geometry.arrays import Float, UInt8
 from ..records import Features, WorkingImage
 
 WORDS = 64
@@ -37,10 +37,11 @@ class VladDescriber:
             samples.append(vectors[rng.permutation(len(vectors))[:per_image]])
         training = np.vstack(samples) if samples else np.zeros((0, 128), np.float32)
         if len(training) < WORDS:  # next to no texture: any words do, retrieval will find nothing either way
-            training = _unit(rng.integers(1, 255, (WORDS, 128)))
+            training = _unit(rng.uniform(1.0, 255.0, (WORDS, 128)))
         cv2.setRNGSeed(self._seed)
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 15, 1e-4)
-        _, _, words = cv2.kmeans(training, WORDS, None, criteria, 1, cv2.KMEANS_PP_CENTERS)  # type: ignore[call-overload]
+        labels = np.zeros((len(training), 1), np.int32)
+        _, _, words = cv2.kmeans(training, WORDS, labels, criteria, 1, cv2.KMEANS_PP_CENTERS)
         self._words = np.asarray(words, np.float32)
 
     def describe(self, index: int, image: WorkingImage) -> Float:
@@ -61,6 +62,6 @@ class VladDescriber:
         return np.asarray(flat / np.linalg.norm(flat), np.float32)
 
 
-def _unit(descriptors: Float) -> Float:
+def _unit(descriptors: Float | UInt8) -> Float:
     vectors = np.asarray(descriptors, np.float32)
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
