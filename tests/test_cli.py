@@ -222,7 +222,8 @@ engine = types.ModuleType("onthefly3r.run")
 def reconstruct(photos, out, options, progress, cancel):
     from onthefly3r.errors import Cancelled
     from onthefly3r.protocol import Progress
-    import os
+    import os, zlib
+    import pycolmap  # brings a signal handler of its own
     os.write(1, b"native chatter\\n")
     try:
         for step in range(600):

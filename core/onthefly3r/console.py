@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import tempfile
+import threading
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +25,8 @@ from .errors import Cancelled, MissingDependencyError, OnTheFly3RError, Reconstr
 
 # Failures of the disk or of permissions: the user can mend them, a traceback would not help.
 _DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG)
+
+STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name)]
 
 
 class HumanReporter:
@@ -130,9 +133,10 @@ class JsonReporter:
 class Session:
     """What a command works with: where it reports, and whether it was asked to stop."""
 
-    def __init__(self, reporter: HumanReporter | JsonReporter) -> None:
+    def __init__(self, reporter: HumanReporter | JsonReporter, polite: bool) -> None:
         self.reporter = reporter
         self.stop_asked = False
+        self._polite = polite
         self._warned: set[str] = set()
 
     def cancelled(self) -> bool:
@@ -141,9 +145,22 @@ class Session:
 
     def progress(self, report: protocol.Progress) -> None:
         """Pass a report on; raises `Cancelled` when the user asked to stop."""
+        # Importing pycolmap puts a handler of its own in place that ends the process with a stack trace.
+        self.listen_to_signals()
         if self.stop_asked:
             raise Cancelled("stopped on request")
         self.reporter.progress(report)
+
+    def listen_to_signals(self) -> None:
+        """Let Ctrl-C and termination signals ask this session to stop; does nothing outside the main thread."""
+        if threading.current_thread() is threading.main_thread():
+            for number in STOP_SIGNALS:
+                signal.signal(number, self._stop)
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        if self.stop_asked or not self._polite:
+            raise KeyboardInterrupt
+        self.stop_asked = True
 
     def warning(self, message: str) -> None:
         """Tell a warning once."""
@@ -160,8 +177,8 @@ def session(*, json_lines: bool, out: Path | None = None, polite: bool = True) -
     ends it; without, the first ends it. `out` is the output folder: an unexpected error leaves its traceback there.
     """
     with JsonReporter() if json_lines else HumanReporter() as reporter:
-        here = Session(reporter)
-        with _signals(here, polite), _warnings_to(here):
+        here = Session(reporter, polite)
+        with _signals(here), _warnings_to(here):
             try:
                 yield here
                 return
@@ -188,19 +205,14 @@ def session(*, json_lines: bool, out: Path | None = None, polite: bool = True) -
 
 
 @contextlib.contextmanager
-def _signals(here: Session, polite: bool) -> Iterator[None]:
-    def stop(number: int, frame: FrameType | None) -> None:
-        if here.stop_asked or not polite:
-            raise KeyboardInterrupt
-        here.stop_asked = True
-
-    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name)]
-    before = {number: signal.signal(number, stop) for number in numbers}
+def _signals(here: Session) -> Iterator[None]:
+    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+    here.listen_to_signals()
     try:
         yield
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
 @contextlib.contextmanager
