@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -151,3 +152,10 @@ def name_of(requirement: str) -> str:
 
 def test_no_module_bears_a_standard_library_name() -> None:
     assert not {path.stem for path in MODULES} & set(sys.stdlib_module_names) - {"__init__", "__main__"}
+
+
+def test_method_page_names_modules_that_exist() -> None:
+    page = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`([\w/]+\.py)`", page))
+    assert len(named) > 20
+    assert not {name for name in named if not (PACKAGE / name).is_file()}
