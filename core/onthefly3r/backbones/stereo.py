@@ -15,6 +15,7 @@ WINDOW_PX = 9  # of the least squares
 JUMP_PX = 5  # window at half size in which a jump of the disparity makes a pixel doubtful,
 SLOPE_PX = 1.0  # where it is larger than this,
 JUMP_SHARE = 0.1  # by this part of it
+MIN_CORRELATION = 0.5  # of the two windows
 MAX_SHIFT_PX = 1.5  # a refinement that moves farther has left the match it started from
 
 
@@ -94,8 +95,10 @@ def _least_squares(left: UInt8, right: UInt8, start: Float) -> tuple[Float, Floa
     shift = cv2.blur(gradient * difference, window) / information
     residual = cv2.blur(difference * difference, window) - shift * shift * information  # after the shift
     variance = np.maximum(residual, np.float32(0.0)) / np.maximum(cv2.blur(weight, window), np.float32(1e-4))
-    sigma = np.sqrt(variance / information) / WINDOW_PX
-    lost = ~known | (np.abs(shift) > MAX_SHIFT_PX)
+    correlation = 1.0 - 0.5 * residual / np.maximum(cv2.blur(first * first * weight, window), np.float32(1e-4))
+    lost = ~known | (np.abs(shift) > MAX_SHIFT_PX) | (correlation < MIN_CORRELATION)
+    # The formal error knows only noise; windows that look different may be no match at all.
+    sigma = np.sqrt(variance / information) / (WINDOW_PX * np.maximum(correlation, np.float32(MIN_CORRELATION)) ** 2)
     return np.where(lost, np.float32(np.nan), start - shift), sigma
 
 
