@@ -21,7 +21,8 @@ from ..records import Features
 from .local_sfm import SparseModel
 
 PARAMETERS = ("log_focal", "log_aspect", "k1", "k2", "p1", "p2")
-EFFECTIVE_OBSERVATIONS = 20.0  # independent observations that one image is worth
+EFFECTIVE_OBSERVATIONS = 10.0  # independent observations that one image is worth
+STUDENT = 4.0
 HUBER = 1.5  # in standard deviations of a pixel coordinate
 SCALE_ROUNDS = 2  # how often the pixel noise is estimated anew
 MAX_ITERATIONS = 30
@@ -40,19 +41,35 @@ class IntrinsicsPrior:
     camera: Camera  # the mean, working size; its principal point is kept
     focal_sigma: float  # relative
     aspect_sigma: float = 0.003  # of log(fx / fy)
-    radial_sigma: float = 0.03
-    tangential_sigma: float = 0.003
+    radial_sigma: float = 0.005
+    wave_sigma: float = 0.03
+    tangential_sigma: float = 0.001
 
     def mean(self) -> Float:
         """Return the mean (6,) of `PARAMETERS`."""
         return _parameters(self.camera)
 
-    def sigma(self) -> Float:
-        """Return the standard deviations (6,) of `PARAMETERS`."""
+    def whitening(self) -> Float:
+        """Return the matrix (6, 6) that turns a deviation of `PARAMETERS` into standard deviations."""
         camera = self.camera
         corner = float(np.hypot(camera.width / camera.fx, camera.height / camera.fy)) / 2.0
-        k1, k2, p = self.radial_sigma / corner**2, self.radial_sigma / corner**4, self.tangential_sigma / corner
-        return np.array([self.focal_sigma, self.aspect_sigma, k1, k2, p, p])
+        matrix = np.diag(
+            1.0
+            / np.array(
+                [
+                    self.focal_sigma,
+                    self.aspect_sigma,
+                    self.radial_sigma,
+                    self.wave_sigma,
+                    self.tangential_sigma,
+                    self.tangential_sigma,
+                ]
+            )
+        )
+        matrix[2, 2:4] = np.array([corner**2, corner**4]) / self.radial_sigma
+        matrix[3, 3] *= corner**4
+        matrix[4:, 4:] *= corner
+        return matrix
 
 
 @dataclass(frozen=True)
@@ -98,7 +115,7 @@ def self_calibrate(
         model=problem.to_model(model, state, errors),
         sigma=dict(zip(problem.free, sigma, strict=True)),
         shift={
-            key: (values - priors[key].mean()) / priors[key].sigma()
+            key: priors[key].whitening() @ (values - priors[key].mean())
             for key, values in zip(problem.free, state.intrinsics, strict=True)
         },
         notes=notes,
@@ -117,32 +134,38 @@ class _State:
 
 @dataclass(frozen=True)
 class _Normal:
-    """The normal equations in blocks: images and intrinsics (C) against points (P)."""
+    """The normal equations in blocks: poses and intrinsics (C) against points (P), one block per observation."""
 
     cc: Float  # (D, D)
-    cp: Any  # (D, 3N) sparse
     pp: Float  # (N, 3, 3)
+    pose_point: Float  # (M, 6, 3)
+    intrinsics_point: Float  # (K, N, 6, 3)
     c: Float  # (D,) negative gradient
     p: Float  # (N, 3)
+    image: Int  # (M,)
+    point: Int  # (M,)
 
-    def reduced(self, damping: float) -> tuple[Float, Float, Any, Float]:
-        """Return the damped system without the points (D, D), (D,), cp pp^-1, and pp^-1 (N, 3, 3)."""
-        from scipy import sparse
-
+    def eliminated(self, damping: float) -> tuple[Float, Float, Float]:
+        """Return the root of pp^-1 (N, 3, 3), cp times it (D, 3N), and the damped system of C alone (D, D)."""
         diagonal = np.einsum("nii->ni", self.pp)
-        pp = self.pp + (damping * diagonal)[:, :, None] * np.eye(3) + 1e-12 * diagonal.max() * np.eye(3)
-        inverse = np.linalg.inv(pp)
-        blocks = sparse.bsr_matrix((inverse, np.arange(len(pp)), np.arange(len(pp) + 1)))
-        product = (self.cp @ blocks).tocsr()
+        damped = self.pp + ((damping + DAMPING_RANGE[0]) * diagonal)[:, :, None] * np.eye(3)
+        root = np.swapaxes(np.linalg.inv(np.linalg.cholesky(damped)), 1, 2)
+        cp = np.zeros((len(self.c), len(self.pp), 3))
+        cp[6 * self.image[:, None] + np.arange(6), self.point[:, None]] = self.pose_point @ root[self.point]
+        for row, block in enumerate(self.intrinsics_point[::-1], start=1):
+            first = len(self.c) - row * len(PARAMETERS)
+            cp[first : first + len(PARAMETERS)] = np.swapaxes(block @ root, 0, 1)
+        cp = cp.reshape(len(self.c), -1)
         cc = self.cc + np.diag((damping + DAMPING_RANGE[0]) * np.diag(self.cc))
-        return cc - (product @ self.cp.T).toarray(), self.c - product @ self.p.ravel(), product, inverse
+        return root, cp, cc - cp @ cp.T
 
     def step(self, damping: float) -> tuple[Float, Float]:
-        """Return the damped Newton step of images and intrinsics (D,) and of the points (N, 3)."""
-        matrix, right, _, inverse = self.reduced(damping)
+        """Return the damped Newton step of poses and intrinsics (D,) and of the points (N, 3)."""
+        root, cp, matrix = self.eliminated(damping)
+        p = np.einsum("nji,nj->ni", root, self.p).ravel()
         scale = 1.0 / np.sqrt(np.diag(self.cc))
-        dc = scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * right)
-        dp = np.einsum("nij,nj->ni", inverse, self.p - (self.cp.T @ dc).reshape(-1, 3))
+        dc = scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * (self.c - cp @ p))
+        dp = np.einsum("nij,nj->ni", root, (p - cp.T @ dc).reshape(-1, 3))
         return dc, dp
 
 
@@ -159,7 +182,7 @@ class _Problem:
     free: tuple[str, ...]  # camera keys that are estimated
     cameras: Mapping[str, Camera]  # by key: what is held, and the principal points
     mean: Float  # (K, 6)
-    sigma: Float  # (K, 6)
+    whitening: Float  # (K, 6, 6)
 
     @classmethod
     def of(
@@ -174,9 +197,10 @@ class _Problem:
         tracks = [model.tracks[i] for i in images]
         counts = np.array([len(track.points) for track in tracks])
         point = np.concatenate([track.points for track in tracks])
-        order = np.argsort(point, kind="stable")
         pixel = np.concatenate([features[i].pixels[model.tracks[i].features] for i in images]).astype(float)
         image = np.repeat(np.arange(len(images)), counts)
+        # Sorted by point; an image that holds two features of one point counts with the first of them.
+        order = np.unique(point * len(images) + image, return_index=True)[1]
         used = tuple(keys[i] for i in images)
         free = tuple(sorted(set(used) - held))
         return cls(
@@ -189,7 +213,7 @@ class _Problem:
             free=free,
             cameras=dict(model.cameras),
             mean=np.array([priors[key].mean() for key in free]).reshape(-1, len(PARAMETERS)),
-            sigma=np.array([priors[key].sigma() for key in free]).reshape(-1, len(PARAMETERS)),
+            whitening=np.array([priors[key].whitening() for key in free]).reshape(-1, len(PARAMETERS), len(PARAMETERS)),
         )
 
     def start(self, model: SparseModel) -> _State:
@@ -237,41 +261,53 @@ class _Problem:
         if not np.isfinite(ratio).all():
             return np.inf
         huber = np.where(ratio <= HUBER, 0.5 * ratio**2, HUBER * (ratio - 0.5 * HUBER))
-        prior = (state.intrinsics - self.mean) / self.sigma
-        return float(self.deflation @ huber + 0.5 * np.sum(prior**2))
+        deviation = self.deviation(state)
+        return float(self.deflation @ huber + 0.5 * STUDENT * np.sum(np.log1p(deviation**2 / STUDENT)))
+
+    def deviation(self, state: _State) -> Float:
+        """Return the intrinsics (K, 6) minus the prior mean in standard deviations."""
+        return np.einsum("kij,kj->ki", self.whitening, state.intrinsics - self.mean)
 
     def normal_equations(self, state: _State, noise_px: float) -> _Normal:
-        from scipy import sparse
-
-        m, d = len(self.image), 6 * len(self.images) + self.mean.size
+        """Return the normal equations of the reweighted residuals and the priors."""
         residual = self.residuals(state)
         ratio = np.linalg.norm(residual, axis=1) / noise_px
         root = np.sqrt(self.deflation * np.minimum(1.0, HUBER / np.maximum(ratio, 1e-12))) / noise_px
-        by_pose, by_intrinsics, by_point = self.jacobians(state)
-        by_pose, by_point = root[:, None, None] * by_pose, root[:, None, None] * by_point
         residual = root[:, None] * residual
-        values, columns = [by_pose], [6 * self.image[:, None] + np.arange(6)]
-        if self.free:
-            free_row = np.array([self.free.index(k) if k in self.free else 0 for k in self.keys])[self.image]
-            values.append(root[:, None, None] * by_intrinsics)
-            columns.append(6 * len(self.images) + len(PARAMETERS) * free_row[:, None] + np.arange(len(PARAMETERS)))
-        jc = _sparse_rows(np.concatenate(values, axis=2), np.concatenate(columns, axis=1), d)
-        jp = _sparse_rows(by_point, 3 * self.point[:, None] + np.arange(3), 3 * len(state.points))
+        by_pose, by_intrinsics, by_point = (root[:, None, None] * jacobian for jacobian in self.jacobians(state))
+        n, first = len(PARAMETERS), 6 * len(self.images)
+        cc, c = np.zeros((first + self.mean.size,) * 2), np.zeros(first + self.mean.size)
+        for image, key in enumerate(self.keys):
+            rows = np.flatnonzero(self.image == image)
+            columns, parts = [np.arange(6 * image, 6 * image + 6)], [by_pose[rows]]
+            if key in self.free:
+                columns.append(first + n * self.free.index(key) + np.arange(n))
+                parts.append(by_intrinsics[rows])
+            jacobian, column = np.concatenate(parts, axis=2).reshape(2 * len(rows), -1), np.concatenate(columns)
+            cc[np.ix_(column, column)] += jacobian.T @ jacobian
+            c[column] += jacobian.T @ residual[rows].ravel()
+        deviation = self.deviation(state)
+        for k, whitening in enumerate(self.whitening):
+            weighted = whitening.T / (1.0 + deviation[k] ** 2 / STUDENT)
+            block = slice(first + n * k, first + n * (k + 1))
+            cc[block, block] += weighted @ whitening
+            c[block] -= weighted @ deviation[k]
         starts = np.flatnonzero(np.diff(self.point, prepend=-1))
-        seen = self.point[starts]
-        pp, p = np.zeros((len(state.points), 3, 3)), np.zeros((len(state.points), 3))
-        pp[seen] = np.add.reduceat(np.einsum("mki,mkj->mij", by_point, by_point), starts)
-        p[seen] = np.add.reduceat(np.einsum("mki,mk->mi", by_point, residual), starts)
-        prior = np.concatenate([np.zeros(6 * len(self.images)), (1.0 / self.sigma**2).ravel()])
-        pull = np.concatenate(
-            [np.zeros(6 * len(self.images)), ((self.mean - state.intrinsics) / self.sigma**2).ravel()]
-        )
+        point_t = np.swapaxes(by_point, 1, 2)
+        key_of_row = np.array(self.keys)[self.image]
+        blocks = [
+            np.add.reduceat(np.swapaxes(by_intrinsics * (key_of_row == key)[:, None, None], 1, 2) @ by_point, starts)
+            for key in self.free
+        ]
         return _Normal(
-            cc=(jc.T @ jc).toarray() + np.diag(prior),
-            cp=sparse.csr_matrix(jc.T @ jp),
-            pp=pp,
-            c=jc.T @ residual.ravel() + pull,
-            p=p,
+            cc=cc,
+            pp=np.add.reduceat(point_t @ by_point, starts),
+            pose_point=np.swapaxes(by_pose, 1, 2) @ by_point,
+            intrinsics_point=np.array(blocks).reshape(-1, len(starts), n, 3),
+            c=c,
+            p=np.add.reduceat((point_t @ residual[:, :, None])[:, :, 0], starts),
+            image=self.image,
+            point=self.point,
         )
 
     def jacobians(self, state: _State) -> tuple[Float, Float, Float]:
@@ -298,7 +334,7 @@ class _Problem:
     def intrinsics_covariance(self, state: _State, noise_px: float) -> Float:
         """Return the posterior covariance of the free intrinsics."""
         normal = self.normal_equations(state, noise_px)
-        matrix = normal.reduced(0.0)[0]
+        matrix = normal.eliminated(0.0)[2]
         scale = 1.0 / np.sqrt(np.diag(normal.cc))
         covariance = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
         first = 6 * len(self.images)
@@ -343,7 +379,7 @@ def projection_jacobians(camera: Camera, seen: Float) -> tuple[Float, Float]:
 
 
 def _minimise(problem: _Problem, state: _State, noise_px: float) -> tuple[_State, int]:
-    cost, damping = problem.cost(state, noise_px), 1e-4
+    cost, damping = problem.cost(state, noise_px), 1e-6
     for iteration in range(1, MAX_ITERATIONS + 1):
         normal = problem.normal_equations(state, noise_px)
         while True:
@@ -359,15 +395,6 @@ def _minimise(problem: _Problem, state: _State, noise_px: float) -> tuple[_State
         if decrease <= CONVERGED * cost:
             break
     return state, iteration
-
-
-def _sparse_rows(values: Float, columns: Int, width: int) -> Any:
-    """Return a sparse (2M, width) matrix from blocks (M, 2, B) and their columns (M, B)."""
-    from scipy import sparse
-
-    m, _, b = values.shape
-    starts = np.arange(0, 2 * m * b + 1, b)
-    return sparse.csr_matrix((values.ravel(), np.repeat(columns, 2, axis=0).ravel(), starts), shape=(2 * m, width))
 
 
 def _parameters(camera: Camera) -> Float:
