@@ -13,12 +13,15 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..geometry.arrays import Float, Int, UInt8
+from ..geometry.arrays import Float, UInt8
 from ..geometry.camera import Camera
 from ..records import Features
 from .local_sfm import SparseModel
 from .rectify import rectify
+from .sparse import DenseView, precision_worth, ray_angles, sparse_view
 from .stereo import disparity
+
+__all__ = ["DenseView", "choose_partners", "dense_view", "dense_views", "sparse_view"]
 
 BEST_ANGLE_DEG = 14.0  # between the rays of the two images: wide enough to be precise, small enough to match
 ANGLE_SPREAD = 0.6  # standard deviation of its logarithm
@@ -33,21 +36,9 @@ SIGMA_FLOOR_PX = 0.05  # of disparities, from poses and intrinsics
 AGREEMENT_SIGMAS, AGREEMENT_GSD = 3.0, 1.0
 EDGE_PX = 1.0  # disparities of neighbours farther apart are not interpolated
 
-SIGMA_HALF_GSD = 2.5  # depth precision at which a point is worth half
 TRUST_ALONE, TRUST_AGREED, TRUST_DISPUTED = 0.7, 0.95, 0.25
 CONFIRMED, CONTRADICTED = 0.6, 0.3  # factors of doubt and of trust for each other view that says so
 CHECKING_VIEWS = 2
-
-KEYPOINT_SIGMA_PX = 0.5
-CELL_MARGIN_PX = 0.5  # of the point map: a sparse point must project so near to the pixel of its keypoint
-
-
-@dataclass(frozen=True)
-class DenseView:
-    """The point map of one image."""
-
-    points: Float  # (H, W, 3) float32, local frame; NaN where nothing is known
-    confidence: Float  # (H, W) float32 in 0..1; 0 where points are NaN
 
 
 @dataclass(frozen=True)
@@ -114,34 +105,6 @@ def dense_view(
     return _to_view(index, _depth_map(index, images, model, keys, grid, partners), model, keys)
 
 
-def sparse_view(
-    index: int, model: SparseModel, keys: Mapping[int, str], features: Features, grid: tuple[int, int]
-) -> DenseView:
-    """Return a point map (height, width of `grid`) that holds only the sparse points of one image's keypoints.
-
-    A point lies in the pixel its keypoint falls into, of several the one of the lowest feature index, so that a
-    keypoint has the same pixel in every subset. Points that project farther off than `CELL_MARGIN_PX` are left out.
-    """
-    width, height = grid
-    points = np.full((height, width, 3), np.nan, np.float32)
-    confidence = np.zeros((height, width), np.float32)
-    track = model.tracks[index]
-    if len(track.features) == 0:
-        return DenseView(points, confidence)
-    working = model.cameras[keys[index]]
-    camera = working.resized(width, height)
-    places = features.pixels[track.features].astype(float) * (width / working.width, height / working.height)
-    cells = np.floor(places).astype(int)
-    in_camera = model.local_from_cam[index].inverse().apply(model.points[track.points])
-    off_centre = np.abs(camera.project(in_camera) - (cells + 0.5)).max(axis=-1)
-    inside = ((cells >= 0) & (cells < grid)).all(axis=-1)
-    good = np.flatnonzero(inside & (off_centre <= 0.5 + CELL_MARGIN_PX))[::-1]  # the lowest index is written last
-    columns, rows = cells[good].T
-    points[rows, columns] = model.points[track.points[good]]
-    confidence[rows, columns] = _sparse_confidence(index, model, keys)[good]
-    return DenseView(points, confidence)
-
-
 def choose_partners(index: int, model: SparseModel, count: int) -> list[int]:
     """Return up to `count` placed images to match with, best first.
 
@@ -154,7 +117,7 @@ def choose_partners(index: int, model: SparseModel, count: int) -> list[int]:
     for other in sorted(model.local_from_cam):
         shared = np.isin(own, model.tracks[other].points) if other != index else np.zeros(len(own), bool)
         if np.count_nonzero(shared) >= MIN_SHARED_POINTS:
-            angle = np.degrees(_ray_angles(index, other, model, own))
+            angle = np.degrees(ray_angles(index, other, model, own))
             octaves = np.log(np.maximum(angle, 0.01) / BEST_ANGLE_DEG) / ANGLE_SPREAD
             values[other] = np.where(shared, np.exp(-0.5 * octaves**2), 0.0)
     chosen: list[int] = []
@@ -163,13 +126,6 @@ def choose_partners(index: int, model: SparseModel, count: int) -> list[int]:
         worth = np.where(values.pop(best) > 0.1, COVERED_TWICE * worth, worth)
         chosen.append(best)
     return chosen
-
-
-def _ray_angles(index: int, other: int, model: SparseModel, points: Int) -> Float:
-    """Return the angles (N,) in rad between the rays of two images to sparse points (N,)."""
-    first, second = (model.points[points] - model.local_from_cam[i].translation for i in (index, other))
-    cosine = (first * second).sum(axis=-1) / (np.linalg.norm(first, axis=-1) * np.linalg.norm(second, axis=-1))
-    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def _depth_map(
@@ -310,32 +266,6 @@ def _points(index: int, depth_map: _DepthMap, model: SparseModel, keys: Mapping[
 
 def _to_view(index: int, depth_map: _DepthMap, model: SparseModel, keys: Mapping[int, str]) -> DenseView:
     known = np.isfinite(depth_map.depth)
-    precision = _precision_worth(depth_map.sigma, depth_map.depth, model.cameras[keys[index]].fx)
+    precision = precision_worth(depth_map.sigma, depth_map.depth, model.cameras[keys[index]].fx)
     confidence = np.where(known, precision * depth_map.trust, 0.0).astype(np.float32)
     return DenseView(_points(index, depth_map, model, keys), confidence)
-
-
-def _precision_worth(sigma: Float, depth: Float, focal_px: float) -> Float:
-    """Return 1 for a perfect depth, 1/2 where its standard deviation is `SIGMA_HALF_GSD`."""
-    with np.errstate(invalid="ignore"):
-        return np.asarray(1.0 / (1.0 + (sigma * focal_px / (SIGMA_HALF_GSD * depth)) ** 2))
-
-
-def _sparse_confidence(index: int, model: SparseModel, keys: Mapping[int, str]) -> Float:
-    """Return the confidences (M,) of an image's triangulated points.
-
-    The formal depth precision from the reprojection error and all triangulation angles, times the chance that the
-    track holds no mismatch, which halves with every image beyond the first.
-    """
-    own = model.tracks[index].points
-    camera = model.cameras[keys[index]]
-    squared_sines = np.zeros(len(own))
-    for other in model.local_from_cam:
-        if other != index:
-            shared = np.isin(own, model.tracks[other].points)
-            squared_sines[shared] += np.sin(_ray_angles(index, other, model, own[shared])) ** 2
-    error_px = np.hypot(model.reprojection_px[own], KEYPOINT_SIGMA_PX)
-    with np.errstate(divide="ignore"):
-        relative_sigma = error_px / camera.fx / np.sqrt(squared_sines)
-    worth = _precision_worth(relative_sigma, np.ones(len(own)), camera.fx)
-    return np.asarray(worth * (1.0 - 0.5 ** (model.track_length[own] - 1.0)))
