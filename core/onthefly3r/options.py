@@ -168,6 +168,9 @@ class ExportOptions:
     )
     min_confidence: float = option(0.5, "least confidence of an exported point", minimum=0.0, maximum=1.0)
     stray_filter: bool = option(True, "drop isolated points")
+    boundary: str | None = option(
+        None, "GeoJSON file of polygons (WGS 84 longitude, latitude): points outside them are left out of the cloud"
+    )
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from .errors import InputError
+from .export.clip import Boundary, clipped, read_boundary
 from .export.colmap import SparsePoints, write_model
 from .export.footprints import Footprint, footprint, with_overlap, write_footprints
 from .export.las import CloudSummary, las_scale_m, write_cloud
@@ -96,6 +98,8 @@ def write_products(
         options.export.stray_filter,
         lambda done, total: checkpoint("fusing the cloud", done, total),
     )
+    if options.export.boundary is not None:
+        tiles = clipped(tiles, _boundary(Path(options.export.boundary), reference))
     name = f"cloud.{options.export.format}"
     cloud = write_cloud(out / name, tiles, frame.wkt, las_scale_m(spacing_m), title, n_images=len(shots))
     for other in {"cloud.las", "cloud.laz"} - {name}:
@@ -202,6 +206,12 @@ def _cloud(
             batch=np.full(count, stored.submap, np.int32),
             views=np.ones(count, np.int32),
         )
+
+
+def _boundary(path: Path, reference: GeoReference | None) -> Boundary:
+    if reference is None:
+        raise InputError("a boundary needs a georeferenced cloud: leave out --local or the boundary")
+    return read_boundary(path, reference.crs)
 
 
 def _sparse_points(state: MapState, frame: ExportFrame) -> SparsePoints:

@@ -79,7 +79,7 @@ class Job:
             flag = name.replace("_", "-")
             if isinstance(value, bool):
                 words.append(f"--{flag}" if value else f"--no-{flag}")
-            elif isinstance(value, list | tuple):
+            elif isinstance(value, (list, tuple)):
                 words += [f"--{flag}={item}" for item in value]
             elif value is not None:
                 words.append(f"--{flag}={value}")

@@ -14,6 +14,7 @@ from .backbones.registry import create_backbone
 from .engine import Engine
 from .errors import InputError, ReconstructionError
 from .export.atomic import write_text
+from .export.clip import read_rings
 from .export.las import CloudSummary
 from .export.page import write_page
 from .export.report import RejectedImage, RunSummary, Timing, build_report, peak_rss_mib, write_report
@@ -78,6 +79,8 @@ def reconstruct(
     """
     photos, out, options = Path(photos), Path(out), options or Options()
     stopwatch = Stopwatch()
+    if options.export.boundary is not None:
+        read_rings(Path(options.export.boundary))  # a wrong one is told before the work, not after it
     with stopwatch.stage("intake"):
         shots, refused = read_photographs(photos, options.intake)
     backbone = create_backbone(options.backbone)

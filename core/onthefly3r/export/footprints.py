@@ -11,6 +11,7 @@ import numpy as np
 from ..geometry.arrays import Float
 from ..records import PlacedCamera
 from .atomic import replacing
+from .clip import in_ring
 from .vector import esri_wkt
 
 # Oblique views see to the horizon: a footprint ends where the ground is this many flying heights away.
@@ -65,7 +66,7 @@ def with_overlap(footprints: Sequence[Footprint]) -> list[Footprint]:
     centres = np.array([f.centre for f in footprints])
     counts = np.zeros(len(footprints), int)
     for item in footprints:
-        counts += _inside(centres, item.outline)
+        counts += in_ring(centres, item.outline)
     return [Footprint(f.image, f.outline, f.gsd_m, int(count)) for f, count in zip(footprints, counts, strict=True)]
 
 
@@ -95,14 +96,3 @@ def _clockwise(ring: Float) -> Float:
     """Shapefiles want outer rings clockwise."""
     x, y = ring.T
     return ring if x @ np.roll(y, -1) - y @ np.roll(x, -1) < 0.0 else ring[::-1]
-
-
-def _inside(points: Float, ring: Float) -> Float:
-    """Return which points (N, 2) lie inside a ring (M, 2), by crossing parity."""
-    inside = np.zeros(len(points), bool)
-    for (x0, y0), (x1, y1) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-        crosses = (y0 > points[:, 1]) != (y1 > points[:, 1])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            at_x = x0 + (points[:, 1] - y0) * (x1 - x0) / (y1 - y0)
-        inside ^= crosses & (points[:, 0] < at_x)
-    return inside

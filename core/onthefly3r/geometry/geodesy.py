@@ -99,7 +99,7 @@ class WorldFrame:
     def to_enu(self, points: Float) -> Float:
         """Map easting, northing and height (N, 3) back to ENU."""
         east, north, height = np.moveaxis(np.asarray(points, float), -1, 0)
-        lon, lat = _projected_from_geographic(self.crs).transform(east, north, direction="INVERSE", errcheck=True)
+        lon, lat = projected_from_geographic(self.crs).transform(east, north, direction="INVERSE", errcheck=True)
         height = height + undulation_m(self.vertical, lat, lon)
         return self.enu.from_geographic(np.stack([lat, lon, height], axis=-1))
 
@@ -116,7 +116,7 @@ class WorldFrame:
 
     def _from_enu(self, points: Float, geoid: bool) -> Float:
         lat, lon, height = np.moveaxis(self.enu.to_geographic(points), -1, 0)
-        east, north = _projected_from_geographic(self.crs).transform(lon, lat, errcheck=True)
+        east, north = projected_from_geographic(self.crs).transform(lon, lat, errcheck=True)
         if geoid:
             height = height - undulation_m(self.vertical, lat, lon)
         return np.stack([east, north, height], axis=-1)
@@ -215,7 +215,8 @@ def _geocentric_from_geographic() -> Transformer:
 
 
 @lru_cache(maxsize=8)
-def _projected_from_geographic(crs: str) -> Transformer:
+def projected_from_geographic(crs: str) -> Transformer:
+    """Return the transformation from WGS 84 longitude, latitude to a projected CRS; raises `OptionError`."""
     from pyproj import Transformer
     from pyproj.exceptions import ProjError
 
