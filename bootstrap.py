@@ -1,9 +1,11 @@
 """Set up On-the-Fly3R in an environment of its own beside this file, and run it there.
 
-    python3 bootstrap.py setup                        make .venv and install the package
+    python3 bootstrap.py setup [--environment FOLDER] [--extra NAME]
+                                                      make FOLDER or .venv and install the package
     python3 bootstrap.py demo [OUT]                   render a small survey and reconstruct it
     python3 bootstrap.py run PHOTOS OUT [options...]  reconstruct a folder of photographs
     python3 bootstrap.py test [pytest arguments...]   lint, types and tests
+    python3 bootstrap.py package                      write the zip of the QGIS plugin
 
 Standard library only, Linux, macOS and Windows, no administrator rights. Other programs may import this
 module and call `create_environment`.
@@ -252,10 +254,14 @@ def missing_system_libraries(python: Path) -> list[str]:
     return [f"{check['name']}: {check['remedy']}" for check in checks if check.get("missing_libraries")]
 
 
-def setup(environment: Path) -> int:
-    """Make the environment, with torch where an NVIDIA GPU is found."""
-    extras = ("neural",) if has_nvidia_gpu() else ()
-    python = create_environment(environment, extras)
+def setup(environment: Path, rest: Sequence[str] = ()) -> int:
+    """Make the environment, with torch where an NVIDIA GPU is found and the folder is not named."""
+    parser = argparse.ArgumentParser(prog="bootstrap.py setup")
+    parser.add_argument("--environment", type=Path, help="folder of the environment (default: .venv)")
+    parser.add_argument("--extra", action="append", choices=("neural", "cloud"), default=[], help="packages to add")
+    chosen = parser.parse_args(rest)
+    extras = chosen.extra or (["neural"] if chosen.environment is None and has_nvidia_gpu() else [])
+    python = create_environment(chosen.environment or environment, extras)
     say(f"Ready. Interpreter: {python}")
     return 0
 
@@ -290,12 +296,17 @@ def test(environment: Path, rest: Sequence[str]) -> int:
     return 1 if failed else 0
 
 
+def package() -> int:
+    """Write the zip of the QGIS plugin into `dist`."""
+    return _call([sys.executable, ROOT / "tools" / "package_plugin.py"])
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit status: the verb's own, 2 when the environment cannot be made."""
     parser = argparse.ArgumentParser(
         prog="bootstrap.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("verb", choices=("setup", "demo", "run", "test"))
+    parser.add_argument("verb", choices=("setup", "demo", "run", "test", "package"))
     parser.add_argument("rest", nargs=argparse.REMAINDER, help="what the verb takes")
     chosen = parser.parse_args(arguments)
     if sys.version_info < OLDEST_PYTHON:
@@ -304,7 +315,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     environment = ROOT / ".venv"
     try:
         if chosen.verb == "setup":
-            return setup(environment)
+            return setup(environment, chosen.rest)
+        if chosen.verb == "package":
+            return package()
         if chosen.verb == "demo":
             named = bool(chosen.rest) and not chosen.rest[0].startswith("-")
             out = Path(chosen.rest.pop(0)) if named else Path("demo-survey")

@@ -1,0 +1,280 @@
+"""The results of a run as layers: sinks filled from its files, styled and grouped where QGIS shows them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, ClassVar
+
+from qgis.core import (
+    QgsCoordinateReferenceSystem,
+    QgsFeature,
+    QgsFeatureSink,
+    QgsField,
+    QgsFields,
+    QgsGeometry,
+    QgsMapLayer,
+    QgsProcessing,
+    QgsProcessingAlgorithm,
+    QgsProcessingContext,
+    QgsProcessingException,
+    QgsProcessingFeedback,
+    QgsProcessingLayerPostProcessorInterface,
+    QgsProcessingParameterFeatureSink,
+    QgsProcessingUtils,
+    QgsProject,
+    QgsProviderRegistry,
+    QgsVectorLayer,
+    QgsWkbTypes,
+)
+from qgis.PyQt.QtCore import QVariant
+
+from .base import ROOT, tr
+from .parameters import add
+
+STYLES = ROOT / "resources" / "styles"
+CAMERAS, REJECTED, FOOTPRINTS = "CAMERAS", "REJECTED", "FOOTPRINTS"
+MAX_REPORT_BYTES = 64 * 1024 * 1024
+
+TEXT, REAL, WHOLE, TRUTH = QVariant.String, QVariant.Double, QVariant.Int, QVariant.Bool
+CAMERA_FIELDS = (
+    *((name, TEXT) for name in ("image", "status", "reason")),
+    *((name, REAL) for name in ("x", "y", "z", "omega", "phi", "kappa", "yaw", "pitch", "roll")),
+    *((name, REAL) for name in ("gps_x", "gps_y", "gps_z", "dx", "dy", "dz", "d_h", "d_3d", "sig_h", "sig_v")),
+    ("rtk", WHOLE),
+    ("used", TRUTH),
+    ("retries", WHOLE),
+    ("batch", WHOLE),
+    ("t_utc", TEXT),
+    ("cam", TEXT),
+)
+REJECTED_FIELDS = (
+    *((name, TEXT) for name in ("image", "stage", "reason")),
+    *((name, REAL) for name in ("gps_x", "gps_y", "gps_z")),
+    ("retries", WHOLE),
+    ("t_utc", TEXT),
+    ("cam", TEXT),
+)
+FOOTPRINT_FIELDS = (("image", TEXT), ("gsd_m", REAL), ("area_m2", REAL), ("overlap", WHOLE))
+
+Row = tuple[dict[str, Any], "QgsGeometry | None"]
+
+
+def make_fields(described: Iterable[tuple[str, Any]]) -> QgsFields:
+    """Return QGIS fields of (name, type)."""
+    fields = QgsFields()
+    for name, kind in described:
+        fields.append(QgsField(name, kind))
+    return fields
+
+
+def add_camera_sinks(algorithm: QgsProcessingAlgorithm) -> None:
+    """Add the layers that every run has."""
+    point, polygon = QgsProcessing.TypeVectorPoint, QgsProcessing.TypeVectorPolygon
+    add(
+        algorithm,
+        QgsProcessingParameterFeatureSink(CAMERAS, tr("Cameras"), point, optional=True),
+        tr("Where each placed photograph was taken, its angles, and how far its tagged position is from there."),
+    )
+    add(
+        algorithm,
+        QgsProcessingParameterFeatureSink(REJECTED, tr("Rejected photographs"), point, optional=True),
+        tr("What could not be used, with the reason; at the tagged position, or without geometry where there is none."),
+    )
+    add(
+        algorithm,
+        QgsProcessingParameterFeatureSink(FOOTPRINTS, tr("Footprints"), polygon, optional=True),
+        tr("The ground that each placed photograph covers, and how many photographs cover its middle."),
+    )
+
+
+def read_report(path: Path) -> dict[str, Any]:
+    """Return a run's report; raises `QgsProcessingException` when there is none."""
+    try:
+        if path.stat().st_size > MAX_REPORT_BYTES:
+            raise ValueError(f"larger than {MAX_REPORT_BYTES} bytes")
+        report = json.loads(path.read_text(encoding="utf-8"))
+        report["images"]["placed"]
+        return report
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise QgsProcessingException(tr("{} cannot be read ({}).").format(path, error)) from error
+
+
+def fill_camera_sinks(
+    algorithm: QgsProcessingAlgorithm,
+    parameters: dict[str, Any],
+    context: QgsProcessingContext,
+    feedback: QgsProcessingFeedback,
+    run: Path,
+) -> dict[str, Any]:
+    """Fill the sinks of `add_camera_sinks` from the files of a run and return their destinations."""
+    report = read_report(run / "report.json")
+    crs = run_crs(report)
+    cameras = list(read_rows(run / "cameras.shp", CAMERA_FIELDS))
+    placed = [row for row in cameras if row[0]["status"] == "placed"]
+    footprints = list(read_rows(run / "footprints.shp", FOOTPRINT_FIELDS))
+    sinks = (
+        (CAMERAS, CAMERA_FIELDS, QgsWkbTypes.PointZ, placed, "cameras.qml"),
+        (REJECTED, REJECTED_FIELDS, QgsWkbTypes.PointZ, rejected_rows(report, cameras), "rejected.qml"),
+        (FOOTPRINTS, FOOTPRINT_FIELDS, QgsWkbTypes.Polygon, footprints, "footprints.qml"),
+    )
+    results: dict[str, Any] = {}
+    for name, fields, geometry, rows, style in sinks:
+        if parameters.get(name) in (None, ""):
+            continue
+        results[name] = fill_sink(algorithm, parameters, context, name, fields, geometry, crs, rows)
+        show(context, results[name], run.name, style)
+        feedback.pushInfo(f"{algorithm.parameterDefinition(name).description()}: {len(rows)}")
+    return results
+
+
+def fill_sink(
+    algorithm: QgsProcessingAlgorithm,
+    parameters: dict[str, Any],
+    context: QgsProcessingContext,
+    name: str,
+    described: Iterable[tuple[str, Any]],
+    geometry_type: Any,
+    crs: QgsCoordinateReferenceSystem,
+    rows: Iterable[Row],
+) -> str:
+    """Write rows into a sink and return its destination."""
+    fields = make_fields(described)
+    sink, destination = algorithm.parameterAsSink(parameters, name, context, fields, geometry_type, crs)
+    if sink is None:
+        raise QgsProcessingException(algorithm.invalidSinkError(parameters, name))
+    names = [field.name() for field in fields]
+    for values, geometry in rows:
+        feature = QgsFeature(fields)
+        feature.setAttributes([values.get(name) for name in names])
+        if geometry is not None:
+            feature.setGeometry(geometry)
+        if not sink.addFeature(feature, QgsFeatureSink.FastInsert):
+            raise QgsProcessingException(algorithm.writeFeatureError(sink, parameters, name))
+    del sink  # closes the file
+    return destination
+
+
+def run_crs(report: dict[str, Any]) -> QgsCoordinateReferenceSystem:
+    """Return the CRS of a run, an invalid one for a run in map units."""
+    crs, geo = QgsCoordinateReferenceSystem(), report.get("georeference")
+    if geo and not crs.createFromUserInput(geo["crs"]):
+        raise QgsProcessingException(tr("QGIS does not know the coordinate reference system {}.").format(geo["crs"]))
+    return crs
+
+
+def read_rows(path: Path, described: Iterable[tuple[str, Any]]) -> Iterable[Row]:
+    """Yield attributes and geometry of a shapefile's features, nothing where it is missing."""
+    if not path.is_file():
+        return
+    layer = QgsVectorLayer(str(path), path.stem, "ogr")
+    if not layer.isValid():
+        raise QgsProcessingException(tr("{} cannot be read.").format(path))
+    convert: dict[Any, Callable[[Any], Any]] = {TEXT: str, REAL: float, WHOLE: int, TRUTH: _truth}
+    kinds = dict(described)
+    known = [field.name() for field in layer.fields()]
+    for feature in layer.getFeatures():
+        values = {name: feature.attribute(name) for name in known}
+        row = {
+            name: None if _is_null(values.get(name)) else convert[kind](values[name]) for name, kind in kinds.items()
+        }
+        yield row, QgsGeometry(feature.geometry())
+
+
+def rejected_rows(report: dict[str, Any], cameras: Iterable[Row]) -> list[Row]:
+    """Return all rejected photographs of a report; those with a tagged position have a geometry."""
+    known = {values["image"]: (values, geometry) for values, geometry in cameras if values["status"] == "rejected"}
+    rows = []
+    for item in report["images"]["rejected"]:
+        values, geometry = known.get(item["image"], ({}, None))
+        rows.append(({**values, "image": item["image"], "stage": item["stage"], "reason": item["reason"]}, geometry))
+    return rows
+
+
+def _is_null(value: Any) -> bool:
+    return value is None or (isinstance(value, QVariant) and value.isNull())
+
+
+def _truth(value: Any) -> bool:
+    """Some versions of GDAL give the shapefile's logical field as text."""
+    return value in (True, 1, "T", "t", "Y", "y", "1")
+
+
+class Presentation(QgsProcessingLayerPostProcessorInterface):
+    """Styles a layer that was loaded and puts it into the group of its run; works in the main thread."""
+
+    kept: ClassVar[list[Presentation]] = []  # QGIS holds no reference of its own
+    MOST_KEPT = 200
+
+    def __init__(self, group: str, style: str) -> None:
+        super().__init__()
+        self._group, self._style = group, style
+        Presentation.kept[:] = [*Presentation.kept[1 - self.MOST_KEPT :], self]
+
+    def postProcessLayer(self, layer: QgsMapLayer, context: QgsProcessingContext, feedback: Any) -> None:
+        """Style and group `layer`."""
+        if self._style == "cloud":
+            _colour_cloud(layer)
+        elif self._style:
+            layer.loadNamedStyle(str(STYLES / self._style))
+        layer.triggerRepaint()
+        project = context.project() or QgsProject.instance()
+        group_into(project, layer, self._group)
+
+
+def group_into(project: QgsProject, layer: QgsMapLayer, name: str) -> None:
+    """Move a layer of the project into a group, which is made where it is missing."""
+    root = project.layerTreeRoot()
+    node = root.findLayer(layer.id())
+    if node is None or not name or (node.parent() and node.parent().name() == name):
+        return
+    group = root.findGroup(name) or root.insertGroup(0, name)
+    group.insertChildNode(_place(layer, group), node.clone())
+    node.parent().removeChildNode(node)
+
+
+def _place(layer: QgsMapLayer, group: Any) -> int:
+    """Points above polygons above clouds."""
+    return 0 if isinstance(layer, QgsVectorLayer) and layer.wkbType() != QgsWkbTypes.Polygon else len(group.children())
+
+
+def _colour_cloud(layer: QgsMapLayer) -> None:
+    import qgis.core
+
+    renderer = getattr(qgis.core, "QgsPointCloudRgbRenderer", None)
+    if renderer is not None and hasattr(layer, "setRenderer"):
+        layer.setRenderer(renderer())
+
+
+def show(context: QgsProcessingContext, destination: str, group: str, style: str) -> None:
+    """Give a layer that will be loaded its style and group."""
+    if context.willLoadLayerOnCompletion(destination):
+        context.layerToLoadOnCompletionDetails(destination).setPostProcessor(Presentation(group, style))
+
+
+def load_cloud(context: QgsProcessingContext, feedback: QgsProcessingFeedback, path: str, group: str) -> None:
+    """Ask QGIS to load a point cloud, or say why it cannot."""
+    if "pdal" not in QgsProviderRegistry.instance().providerList():
+        feedback.pushInfo(tr("This QGIS has no reader for LAS files (PDAL): the point cloud is in {}.").format(path))
+        return
+    project = context.project()
+    if project is None:
+        return
+    details = QgsProcessingContext.LayerDetails(
+        tr("Point cloud"), project, "CLOUD", QgsProcessingUtils.LayerHint.PointCloud
+    )
+    details.setPostProcessor(Presentation(group, "cloud"))
+    details.forceName = True
+    context.addLayerToLoadOnCompletion(path, details)
+
+
+def remove_stale_index(cloud: Path) -> None:
+    """Remove what QGIS made beside an earlier cloud: it would be shown instead of the new one."""
+    for stale in (cloud.with_name(f"{cloud.stem}.copc.laz"), cloud.with_name(f"ept_{cloud.stem}")):
+        if stale.is_file():
+            stale.unlink()
+        elif stale.is_dir():
+            import shutil
+
+            shutil.rmtree(stale, ignore_errors=True)
