@@ -6,12 +6,14 @@ import dataclasses
 from dataclasses import dataclass
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 
 from onthefly3r.backbones import dense
 from onthefly3r.backbones.dense import DenseView, choose_partners, dense_view, dense_views, sparse_view
 from onthefly3r.backbones.local_sfm import SparseModel, Track
+from onthefly3r.backbones.stereo import disparity
 from onthefly3r.geometry.camera import Camera
 from onthefly3r.geometry.transforms import Rigid3, rotation_exp
 from onthefly3r.records import Features
@@ -183,6 +185,30 @@ def test_featureless_images_export_nothing(case: Case) -> None:
     assert max((view.confidence >= 0.5).mean() for view in views.values()) < 0.002
 
 
+def test_unlike_images_hardly_match() -> None:
+    first, second = np.random.default_rng(5).integers(60, 190, (2, 240, 320), np.uint8)
+    found, sigma = disparity(first, second, 64)
+    assert np.isfinite(found).mean() < 0.02
+    assert sigma.shape == found.shape == (240, 320)
+
+
+@pytest.mark.parametrize("shift_px", [7.0, 20.4, 33.75])
+def test_disparity_to_a_fraction_of_a_pixel(shift_px: float) -> None:
+    """One texture sampled twice, brighter and flatter in the right image; 0.05 px off in the median, bias included."""
+    rng = np.random.default_rng(2)
+    fine = cv2.GaussianBlur(rng.standard_normal((240, 4 * 400)).astype(np.float32), (0, 0), 6.0, sigmaY=1.5)
+    fine = 128.0 + 40.0 * fine / fine.std()
+    x, y = np.meshgrid(np.arange(320, dtype=np.float32), np.arange(240, dtype=np.float32))
+    left, right = (cv2.remap(fine, 4.0 * (x + start), y, cv2.INTER_CUBIC) for start in (0.0, shift_px))
+    noisy = [image + 2.0 * rng.standard_normal(image.shape) for image in (left, 20.0 + 0.8 * right)]
+    images = [np.clip(image, 1, 255).astype(np.uint8) for image in noisy]
+    found, sigma = disparity(images[0], images[1], 64)
+    error = found[10:-10, 80:-10] - shift_px
+    assert np.isfinite(error).mean() > 0.95
+    assert np.nanmedian(np.abs(error)) < 0.05
+    assert 0.3 < np.nanstd(error) / (dense.SIGMA_FACTOR * np.median(sigma[10:-10, 80:-10])) < 1.5
+
+
 def test_unplaced_images_are_left_out_and_lonely_ones_are_empty(case: Case) -> None:
     alone = dataclasses.replace(
         case.model,
@@ -260,20 +286,23 @@ def test_sparse_confidence_follows_angle_error_and_track_length() -> None:
     assert usual > 0.4  # 0.58 px over angles of 11 degrees: 2 ground sampling distances
     assert confidence([0.0, 0.4, -0.4]) < 0.5 * usual  # 2 degrees
     assert confidence([0.0, 2.0, -2.0], reprojection_px=np.full(11, 2.0)) < 0.7 * usual
-    assert confidence([0.0, 2.0], track_length=np.full(11, 2)) < 0.5  # a mismatch along the ray is not seen by two
+    # a mismatch along the ray is not seen by two images
+    assert confidence([0.0, 2.0, -2.0], track_length=np.full(11, 2)) == pytest.approx(usual * 0.5 / 0.75)
     assert usual < confidence([0.0, 2.0, -2.0, 3.0]) <= 1.0
 
 
 def test_partners_have_a_good_angle_and_cover_what_others_do_not() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform((-3.0, -2.0, 9.0), (3.0, 2.0, 11.0), (200, 3))
-    positions = [0.0, 0.3, 2.5, 2.7, 8.0]  # 2, 14, 15 and 39 degrees
+    positions = [0.0, 0.3, 2.5, 2.7, 3.6]  # 2, 14, 15 and 20 degrees
     model = row_of_cameras(points, positions)
     assert choose_partners(0, model, 1) == [2]
-    left = Track(*(2 * (np.flatnonzero(points[:, 0] < 0.0),)))
-    right = Track(*(2 * (np.flatnonzero(points[:, 0] >= 0.0),)))
-    split = dataclasses.replace(model, tracks={**model.tracks, 1: left, 2: left, 3: right, 4: right})
-    assert set(choose_partners(0, split, 2)) == {2, 3}
+    left = Track(*(2 * (np.flatnonzero(points[:, 0] < 0.3),)))
+    right = Track(*(2 * (np.flatnonzero(points[:, 0] >= 0.3),)))
+    split = dataclasses.replace(model, tracks={**model.tracks, 1: right, 2: left, 3: left, 4: right})
+    best, second = choose_partners(0, split, 2)
+    assert best in (2, 3)  # alike, and each alone is worth more than image 4
+    assert second == 4
     few = Track(np.arange(5), np.arange(5))
     assert choose_partners(0, dataclasses.replace(model, tracks=dict.fromkeys(range(5), few)), 2) == []
 
@@ -287,6 +316,17 @@ def test_partners_that_agree_are_averaged_others_are_doubted() -> None:
     np.testing.assert_allclose(merged.sigma[0, :3], [0.01 / np.sqrt(1.25), 0.01, 0.02], rtol=1e-5)
     agreed, disputed, alone, unknown = merged.trust[0]
     assert agreed > alone > 0.5 > disputed > unknown == 0.0
+
+
+def test_confidence_is_trust_times_precision() -> None:
+    model = row_of_cameras(np.array([[0.0, 0.0, 10.0]]), [0.0])
+    depth, trust = np.full((80, 100), 10.0, np.float32), np.full((80, 100), 0.7, np.float32)
+    gsd = 10.0 / CAMERA.fx
+    for sigma_gsd, expected in ((0.0, 0.7), (2.5, 0.35), (250.0, 0.0)):
+        depth_map = dense._DepthMap(depth, np.full_like(depth, sigma_gsd * gsd), trust)
+        view = dense._to_view(0, depth_map, model, {0: "a"})
+        np.testing.assert_allclose(view.confidence, expected, atol=1e-3)
+        np.testing.assert_allclose(view.points[..., 2], 10.0, rtol=1e-6)
 
 
 def test_other_views_confirm_and_contradict() -> None:

@@ -79,9 +79,10 @@ def test_images_show_what_the_cameras_see(turn: float) -> None:
             assert (image[outside] == 0).all()
 
 
-def test_window_holds_everything_both_images_see() -> None:
-    left, right = pair(1.0, 0.3, 2.0, (0.02, 0.05))
-    points = ground(2000)
+@pytest.mark.parametrize(("heading", "turn"), [(0.0, 0.0), (1.0, 2.0), (np.pi, 0.3)])
+def test_window_holds_everything_both_images_see(heading: float, turn: float) -> None:
+    left, right = pair(heading, 0.3, turn, (0.02, 0.05))
+    points = ground(6000) * (4.0, 4.0, 1.0)
     found = rectify(LEFT, left, RIGHT, right, points, 280.0, 1.0)
     assert found is not None
     in_left, in_right = left.inverse().apply(points), right.inverse().apply(points)
@@ -89,7 +90,7 @@ def test_window_holds_everything_both_images_see() -> None:
     for camera, in_camera in ((LEFT, in_left), (RIGHT, in_right)):
         pixels = camera.project(in_camera)
         seen &= ((pixels > 0.0) & (pixels < (camera.width, camera.height))).all(axis=-1)
-    assert seen.sum() > 300
+    assert seen.sum() > 500
     pixels, _ = found.pixels((in_left / in_left[:, 2:])[None])
     inside = (pixels[0] > (found.disparities - 1.0, -1.0)) & (pixels[0] < (found.width, found.height))
     assert inside[seen].all()
