@@ -17,7 +17,7 @@ SUFFIXES = {".py", ".typed", ".txt", ".md", ".svg", ".qml", ".csv", ".gz", ".png
 
 
 def package(out: Path | None = None) -> Path:
-    """Write `dist/onthefly3r_qgis-<version>.zip` (or `out`), return its path; raises `ValueError` when it is too big."""
+    """Write `dist/onthefly3r_qgis-<version>.zip` or `out`, return its path; raises `ValueError` when it is too big."""
     version = plugin_version()
     out = out or ROOT / "dist" / f"{NAME}-{version}.zip"
     out.parent.mkdir(parents=True, exist_ok=True)

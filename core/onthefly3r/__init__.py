@@ -9,8 +9,8 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .engine import Engine
-    from .run import Result, reconstruct
     from .options import Options
+    from .run import Result, reconstruct
 
 __all__ = ["Engine", "Options", "Result", "__version__", "reconstruct"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from .export.report import RejectedImage, RunSummary, Timing, build_report, peak
 from .geometry.transforms import Rigid3
 from .intake.folder import read_photographs
 from .intake.images import load_working_image
+from .intake.positions_file import read_positions, with_positions
 from .mapping.georef import georeference
 from .mapping.ground import ground_normal
 from .mapping.journal import shot_from_json, shot_to_json
@@ -83,6 +84,7 @@ def reconstruct(
         read_rings(Path(options.export.boundary))  # a wrong one is told before the work, not after it
     with stopwatch.stage("intake"):
         shots, refused = read_photographs(photos, options.intake)
+        shots = _with_positions(shots, options)
     backbone = create_backbone(options.backbone)
     work = _fresh_work_folder(out)
     engine = Engine(
@@ -122,6 +124,8 @@ def export_again(
     store = Store(run / "work")
     state = MapState.load(store)
     outcome = _read_run(run / "work" / "run.json")
+    placed_anew = _with_positions([shot for _, shot in sorted(outcome.shots.items())], options)
+    outcome = replace(outcome, shots=dict(zip(sorted(outcome.shots), placed_anew, strict=True)))
     out.mkdir(parents=True, exist_ok=True)
     return _finish(out, out / "work", state, store, outcome, options, stopwatch, progress, None)
 
@@ -210,6 +214,11 @@ def _finish(
 def _georeference(state: MapState, shots: dict[int, Shot], options: Options, up: Any) -> GeoReference:
     poses: dict[int, Rigid3] = {index: state.map_from_cam(index) for index in state.frames}
     return georeference(poses, shots, options.georeference, up)
+
+
+def _with_positions(shots: list[Shot], options: Options) -> list[Shot]:
+    file = options.georeference.positions
+    return shots if file is None else with_positions(shots, read_positions(Path(file)))
 
 
 def _describer(backbone: Backbone) -> Describer:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections import OrderedDict
 from pathlib import Path
@@ -24,6 +23,7 @@ def extract_features(rgb: UInt8, max_features: int, extractor: Any = None) -> Fe
     doubled octave costs four times as much and adds few matches.
     """
     import cv2
+
     pycolmap = load_pycolmap()
 
     extractor = extractor or new_extractor(max_features)
@@ -106,7 +106,7 @@ class FeatureStore:
             angles=features.angles,
             descriptors=features.descriptors,
         )
-        os.replace(temporary, path)
+        temporary.replace(path)
 
     def _remember(self, index: int, features: Features) -> None:
         with self._lock:

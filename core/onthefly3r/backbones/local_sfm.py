@@ -128,7 +128,7 @@ def _to_sparse_model(model: Any, camera_ids: Mapping[str, int]) -> SparseModel:
         seen = [(i, row[p.point3D_id]) for i, p in enumerate(image.points2D) if p.has_point3D()]
         table = np.array(seen, np.int64).reshape(-1, 2)
         tracks[index] = Track(table[:, 0], table[:, 1])
-    used = {camera_id: camera for camera_id, camera in model.cameras.items()}
+    used = model.cameras
     return SparseModel(
         local_from_cam=poses,
         cameras={key: _from_pycolmap(used[camera_id]) for key, camera_id in camera_ids.items() if camera_id in used},

@@ -79,7 +79,7 @@ def mutual_matches(first: Features, second: Features) -> Int:
 
 
 def _distance(cosine: Float) -> Float:
-    return np.sqrt(np.maximum(2.0 - 2.0 * cosine, 0.0))
+    return np.asarray(np.sqrt(np.maximum(2.0 - 2.0 * cosine, 0.0)))
 
 
 def to_pycolmap_camera(camera: Camera, camera_id: int) -> Any:
