@@ -162,6 +162,7 @@ class GeoreferenceOptions:
 class ExportOptions:
     """The files in the output folder."""
 
+    cloud: bool = option(True, "write the point cloud; off leaves cameras, footprints, COLMAP model and report")
     format: Literal["laz", "las"] = option("laz", "point cloud format", choices=("laz", "las"))
     spacing_m: float | None = option(
         None,

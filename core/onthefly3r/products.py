@@ -84,12 +84,41 @@ def write_products(
     options: Options,
     title: str,
     checkpoint: Callable[[str, int, int], None],
-) -> CloudSummary:
-    """Write all files but the report into `out`; raises `ReconstructionError` when the cloud has no points."""
+) -> CloudSummary | None:
+    """Write all files but the report into `out` and return the cloud's summary, None when none is asked for.
+
+    Raises `ReconstructionError` when the cloud has no points.
+    """
     cameras = placed_cameras(state, shots, retries, frame)
     rows = camera_rows(cameras, state, shots, rejections, retries, reference, frame, options)
-    scale = frame.level_from_map.scale
-    spacing_m = options.export.spacing_m or scale * state.spacing
+    cloud = _write_cloud(out, work, state, store, len(shots), reference, frame, options, title, checkpoint)
+    write_cameras(out / "cameras.shp", rows, reference.crs if reference else None)
+    write_footprints(out / "footprints.shp", footprints(cameras, state, frame), reference.crs if reference else None)
+    write_trajectory(out / "trajectory.csv", rows)
+    write_model(out / "colmap", cameras, _sparse_points(state, frame))
+    if cloud is not None:
+        write_preview(out / "preview.png", cloud, rows, title, georeferenced=reference is not None)
+    return cloud
+
+
+def _write_cloud(
+    out: Path,
+    work: Path,
+    state: MapState,
+    store: Store,
+    n_images: int,
+    reference: GeoReference | None,
+    frame: ExportFrame,
+    options: Options,
+    title: str,
+    checkpoint: Callable[[str, int, int], None],
+) -> CloudSummary | None:
+    """Fuse and write the cloud in the format that is asked for, without leaving an earlier one beside it."""
+    if not options.export.cloud:
+        for stale in ("cloud.las", "cloud.laz", "preview.png"):
+            (out / stale).unlink(missing_ok=True)
+        return None
+    spacing_m = options.export.spacing_m or frame.level_from_map.scale * state.spacing
     tiles = fuse(
         _cloud(state, store, frame, checkpoint),
         spacing_m,
@@ -101,14 +130,9 @@ def write_products(
     if options.export.boundary is not None:
         tiles = clipped(tiles, _boundary(Path(options.export.boundary), reference))
     name = f"cloud.{options.export.format}"
-    cloud = write_cloud(out / name, tiles, frame.wkt, las_scale_m(spacing_m), title, n_images=len(shots))
+    cloud = write_cloud(out / name, tiles, frame.wkt, las_scale_m(spacing_m), title, n_images=n_images)
     for other in {"cloud.las", "cloud.laz"} - {name}:
         (out / other).unlink(missing_ok=True)
-    write_cameras(out / "cameras.shp", rows, reference.crs if reference else None)
-    write_footprints(out / "footprints.shp", footprints(cameras, state, frame), reference.crs if reference else None)
-    write_trajectory(out / "trajectory.csv", rows)
-    write_model(out / "colmap", cameras, _sparse_points(state, frame))
-    write_preview(out / "preview.png", cloud, rows, title, georeferenced=reference is not None)
     return cloud
 
 
