@@ -26,6 +26,7 @@ STATED_ALTITUDE_M = 100.0
 CACHED_DEPTH_MAPS = 600  # about 150 KB each
 TOKEN_LENGTH = 64
 CAMERA_KEY = "simulated"
+COVISIBLE_WIDTHS = 0.6  # views whose footprints are less than so many widths apart see enough of the same ground
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class Noise:
     position_m: float = 0.3
     depth: float = 0.002  # relative, once per pixel and once per image
     log_scale: float = 0.10
+    bend_m: float = 0.0  # sag at one flying height from the middle, up or down; grows with the square of the extent
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ class Faults:
     bad_queries: int = 1
     bad_query_rate: float = 0.0
     in_seed: bool = False  # subsets without references are affected too
+    bad_view_rate: float = 0.0  # chance of every view of every subset to be bad, whatever its role
+    strays: bool = False  # views that share no ground with the main group are put into its middle, or block on block
     doming_m: float = 0.0  # sag of every local model at one flying height from its middle
     rotation_deg: float = 30.0
     position_m: float = 40.0
@@ -65,6 +69,7 @@ class OracleBackbone:
         faults: Faults | None = None,
         seed: int = 0,
         tokens: bool = False,
+        grid_side_px: int = GRID_SIDE_PX,
     ) -> None:
         self.spec = BackboneSpec("oracle", "1", "GPL-2.0-or-later", confidence_threshold=0.5, has_tokens=tokens)
         self.calls = 0
@@ -72,6 +77,7 @@ class OracleBackbone:
         self._noise = noise or Noise()
         self._faults = faults or Faults()
         self._seed = seed
+        self._grid = grid_camera(survey.views[0].camera, grid_side_px)
         self._unit_m = survey.options.altitude_m / STATED_ALTITUDE_M
         self._depths: OrderedDict[int, Float] = OrderedDict()
 
@@ -82,20 +88,24 @@ class OracleBackbone:
         rng = np.random.default_rng((self._seed, self.calls))
         self.calls += 1
         bad = self._draw_bad_views(subset, rng)
+        moves = self._draw_strays(subset, rng) if self._faults.strays else {}
         centres = np.stack([self._survey.views[i].enu_from_cam.translation for i in subset.members])
-        bend = Bowl(centres.mean(axis=0), self._faults.doming_m * self._unit_m, self._survey.options.altitude_m)
+        sag_m = self._faults.doming_m + (self._noise.bend_m * rng.standard_normal() if self._noise.bend_m else 0.0)
+        bend = Bowl(centres.mean(axis=0), sag_m * self._unit_m, self._survey.options.altitude_m)
         scale = np.exp(self._noise.log_scale * rng.standard_normal()) / self._survey.options.altitude_m
         local_from_enu = Sim3(float(scale), rotation_exp(_random_rotation(rng)), rng.normal(0.0, 3.0, 3))
         context = _unit(rng.standard_normal(TOKEN_LENGTH))
-        views = {i: self._view(i, i in bad, bend, local_from_enu, context, rng) for i in subset.members}
+        views = {
+            i: self._view(i, i in bad, bend, local_from_enu @ moves.get(i, Sim3()), context, rng)
+            for i in subset.members
+        }
         known = {} if CAMERA_KEY in calibrations else {CAMERA_KEY: self._survey.views[0].camera}
-        return LocalModel(views, calibrations=known, notes={"bad_views": float(len(bad))})
+        return LocalModel(views, calibrations=known, notes={"bad_views": float(len(bad | moves.keys()))})
 
     def true_depth(self, index: int) -> Float:
         """Return the z-depth (H, W) float32 in metres of a view's point map, NaN where it sees the sky."""
         if index not in self._depths:
-            view = self._survey.views[index]
-            grid = grid_camera(view.camera)
+            view, grid = self._survey.views[index], self._grid
             hits = self._survey.scene.view(grid, view.enu_from_cam, grid.pixel_centres())
             self._depths[index] = hits.distances.reshape(grid.height, grid.width).astype(np.float32)
             if len(self._depths) > CACHED_DEPTH_MAPS:
@@ -112,13 +122,44 @@ class OracleBackbone:
             bad.update(int(i) for i in rng.permutation(subset.references)[:count])
         if hit_queries and (subset.references or faults.in_seed):
             bad.update(int(i) for i in rng.permutation(subset.new)[: faults.bad_queries])
+        if faults.bad_view_rate:
+            drawn = rng.random(len(subset.members)) < faults.bad_view_rate
+            bad.update(i for i, hit in zip(subset.members, drawn, strict=True) if hit)
         return bad
+
+    def _draw_strays(self, subset: Subset, rng: np.random.Generator) -> dict[int, Sim3]:
+        """Return the wrong move (in ENU) of every view outside the main group of views that see the same ground."""
+        members = list(subset.members)
+        places = np.stack([footprint_centre(self._survey.views[i]) for i in members])
+        groups = covisible_groups(places, COVISIBLE_WIDTHS * self._footprint_width_m())
+        main = groups[0]
+        moves: dict[int, Sim3] = {}
+        for group in groups[1:]:
+            shift, turn = self._look_alike_shift(places[main], places[group]), np.eye(3)
+            if shift is None:  # nothing tells where it belongs
+                stray_m = self._faults.position_m * self._unit_m
+                shift = places[main].mean(axis=0) - places[group].mean(axis=0) + stray_m * _unit(rng.standard_normal(2))
+                turn = np.asarray(rotation_exp(np.radians(self._faults.rotation_deg) * _unit(rng.standard_normal(3))))
+            middle = np.append(places[group].mean(axis=0), 0.0)
+            moves |= {members[k]: Sim3(1.0, turn, middle - turn @ middle + np.append(shift, 0.0)) for k in group}
+        return moves
+
+    def _look_alike_shift(self, main: Float, group: Float) -> Float | None:
+        """Return the way (2,) from a block that the group sees to one that the main group sees, None without such."""
+        corners = self._survey.scene.blocks
+        seen_by_main, seen_by_group = (
+            [c for c in corners if np.all((places >= c) & (places < c + BLOCK_SIZE_M), axis=-1).any()]
+            for places in (main, group)
+        )
+        return np.asarray(seen_by_main[0] - seen_by_group[0]) if seen_by_main and seen_by_group else None
+
+    def _footprint_width_m(self) -> float:
+        return self._grid.width / self._grid.fx * self._survey.options.altitude_m
 
     def _view(
         self, index: int, is_bad: bool, bend: Bowl, local_from_enu: Sim3, context: Float, rng: np.random.Generator
     ) -> LocalView:
-        view = self._survey.views[index]
-        grid = grid_camera(view.camera)
+        view, grid = self._survey.views[index], self._grid
         rays = grid.rays(grid.pixel_centres())
         bent_from_cam = bend.apply_to_pose(view.enu_from_cam)
         depth = self.true_depth(index).astype(float)
@@ -228,9 +269,22 @@ def footprint_centre(view: TrueView) -> Float:
     return np.asarray(centre[:2] - axis[:2] * centre[2] / min(axis[2], -0.2))
 
 
-def grid_camera(camera: Camera) -> Camera:
-    """Return the camera of the point maps, 224 pixels on the longest side."""
-    ratio = GRID_SIDE_PX / max(camera.width, camera.height)
+def covisible_groups(places: Float, reach_m: float) -> list[list[int]]:
+    """Return the rows of footprint centres (N, 2) in groups linked by distances below `reach_m`, largest first."""
+    near = np.linalg.norm(places[:, None] - places[None], axis=-1) < reach_m
+    group = np.arange(len(places))
+    while True:  # every view takes the lowest number among its neighbours until nothing changes
+        lowest = np.where(near, group, len(places)).min(axis=1)
+        if np.array_equal(lowest, group):
+            break
+        group = lowest
+    groups = [np.flatnonzero(group == number).tolist() for number in np.unique(group)]
+    return sorted(groups, key=len, reverse=True)
+
+
+def grid_camera(camera: Camera, side_px: int = GRID_SIDE_PX) -> Camera:
+    """Return the camera of the point maps with so many pixels on the longest side."""
+    ratio = side_px / max(camera.width, camera.height)
     return camera.resized(round(camera.width * ratio), round(camera.height * ratio))
 
 
@@ -257,9 +311,9 @@ def oracle_shots(survey: Survey) -> list[Shot]:
     return shots
 
 
-def oracle_images(survey: Survey) -> dict[int, WorkingImage]:
+def oracle_images(survey: Survey, side_px: int = GRID_SIDE_PX) -> dict[int, WorkingImage]:
     """Return grey images of the point maps' size by shot index, so that an engine runs without rendering."""
-    grid = grid_camera(survey.views[0].camera)
+    grid = grid_camera(survey.views[0].camera, side_px)
     grey = np.full((grid.height, grid.width, 3), 128, np.uint8)
     images = {}
     for index, shot in enumerate(oracle_shots(survey)):
