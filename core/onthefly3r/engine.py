@@ -127,9 +127,10 @@ class Engine:
     def _prepare(self, index: int) -> tuple[int, PhotographError | None]:
         try:
             image = self._images[index]
-            prepare = getattr(self._backbone, "features_of", None)
-            if prepare is not None:
-                prepare(index, image)
+            for part in (self._backbone, self._describer):  # what both need is extracted once, in this thread
+                features_of = getattr(part, "features_of", None)
+                if features_of is not None:
+                    features_of(index, image)
         except PhotographError as error:
             return index, error
         return index, None

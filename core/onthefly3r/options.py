@@ -81,6 +81,15 @@ class SelectionOptions:
     gps_candidates: bool = option(
         True, "let GPS positions propose reference candidates (they never decide)", advanced=True
     )
+    descriptor: Literal["vlad", "efficientnet", "supscene", "megaloc"] = option(
+        "vlad",
+        "what images are compared by: vlad needs nothing further, the others are neural networks",
+        choices=("vlad", "efficientnet", "supscene", "megaloc"),
+        advanced=True,
+    )
+    descriptor_weights: str | None = option(
+        None, "weights of supscene or megaloc: a file, a folder, or a hub id with its revision", advanced=True
+    )
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from .backbones.base import Backbone
+from .backbones.features import FeatureStore
 from .backbones.registry import create_backbone
 from .engine import Engine
 from .errors import InputError, ReconstructionError
@@ -31,8 +31,7 @@ from .options import Options
 from .products import ExportFrame, write_products
 from .protocol import Progress, ProgressCallback
 from .records import GeoReference, RefusedPhotograph, Rejection, Shot
-from .selection.base import Describer
-from .selection.descriptors import VladDescriber
+from .selection.choice import create_describer
 from .stopwatch import Stopwatch
 
 MAX_RUN_FILE_BYTES = 256 * 1024 * 1024
@@ -82,16 +81,18 @@ def reconstruct(
     stopwatch = Stopwatch()
     if options.export.boundary is not None:
         read_rings(Path(options.export.boundary))  # a wrong one is told before the work, not after it
+    features = FeatureStore(out / "work" / "features", options.backbone.features)
+    backbone = create_backbone(options.backbone, features)
+    describer = create_describer(options.selection, features.features_of, options.backbone.device)
     with stopwatch.stage("intake"):
         shots, refused = read_photographs(photos, options.intake)
         shots = _with_positions(shots, options)
-    backbone = create_backbone(options.backbone)
     work = _fresh_work_folder(out)
     engine = Engine(
         work,
         options,
         backbone,
-        _describer(backbone),
+        describer,
         lambda shot: load_working_image(shot, options.backbone.working_px),
         progress,
         cancel,
@@ -99,6 +100,7 @@ def reconstruct(
     engine.stopwatch = stopwatch
     engine.add_all(shots)
     engine.finish()
+    shutil.rmtree(work / "features", ignore_errors=True)
     write_text(work / "run.json", json.dumps(_run_to_json(engine, refused), ensure_ascii=False))
     outcome = _Outcome(
         engine.shots,
@@ -219,13 +221,6 @@ def _georeference(state: MapState, shots: dict[int, Shot], options: Options, up:
 def _with_positions(shots: list[Shot], options: Options) -> list[Shot]:
     file = options.georeference.positions
     return shots if file is None else with_positions(shots, read_positions(Path(file)))
-
-
-def _describer(backbone: Backbone) -> Describer:
-    features_of = getattr(backbone, "features_of", None)
-    if features_of is None:
-        raise InputError("this backbone has no retrieval descriptor of its own yet; choose classical")
-    return VladDescriber(features_of)
 
 
 def _fresh_work_folder(out: Path) -> Path:

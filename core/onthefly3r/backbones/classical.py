@@ -40,7 +40,7 @@ class ClassicalBackbone:
 
     def features_of(self, index: int, image: WorkingImage) -> Features:
         """Return the local features of an image, extracted on first demand; retrieval uses the same ones."""
-        return self._features.extract(index, image.rgb)
+        return self._features.features_of(index, image)
 
     def reconstruct(
         self, subset: Subset, images: Mapping[int, WorkingImage], calibrations: Mapping[str, Camera]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..geometry.arrays import UInt8
-from ..records import Features
+from ..records import Features, WorkingImage
 from .colmap import load_pycolmap
 
 CACHED_IMAGES = 128  # about 0.6 MB each
@@ -61,9 +61,8 @@ class FeatureStore:
         self._recent: OrderedDict[int, Features] = OrderedDict()
         self._lock = threading.Lock()
         self._per_thread = threading.local()
-        folder.mkdir(parents=True, exist_ok=True)
 
-    def extract(self, index: int, rgb: UInt8) -> Features:
+    def features_of(self, index: int, image: WorkingImage) -> Features:
         """Return the features of one image, extracting them when they are not on disk yet."""
         with self._lock:
             known = self._recent.get(index)
@@ -73,7 +72,7 @@ class FeatureStore:
         if not path.exists():
             if not hasattr(self._per_thread, "extractor"):
                 self._per_thread.extractor = new_extractor(self._max_features)
-            features = extract_features(rgb, self._max_features, self._per_thread.extractor)
+            features = extract_features(image.rgb, self._max_features, self._per_thread.extractor)
             self._write(path, features)
             self._remember(index, features)
         return self.load(index)
@@ -98,6 +97,7 @@ class FeatureStore:
 
     @staticmethod
     def _write(path: Path, features: Features) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_suffix(".part.npz")
         np.savez(
             temporary,

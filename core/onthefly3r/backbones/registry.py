@@ -10,6 +10,7 @@ from importlib import metadata
 from ..errors import MissingDependencyError, OptionError
 from ..options import BackboneOptions
 from .base import Backbone
+from .features import FeatureStore
 
 GROUP = "onthefly3r.backbones"
 BUILT_IN = {
@@ -50,11 +51,15 @@ def load_backbone(name: str) -> Callable[..., Backbone]:
     return factory
 
 
-def create_backbone(options: BackboneOptions) -> Backbone:
-    """Make the backbone that the options name; raises `InputError` with the remedy when it cannot run here."""
+def create_backbone(options: BackboneOptions, features: FeatureStore | None = None) -> Backbone:
+    """Make the backbone that the options name; the classical one shares the run's local features with retrieval.
+
+    Raises `InputError` with the remedy when it cannot run here.
+    """
     if options.backbone in NEED_TRUTH:
         raise OptionError(
             f"backbone {options.backbone}: answers from the truth of a simulated survey, which photographs do not "
             f"have; choose one of {', '.join(backbone_targets())}"
         )
-    return load_backbone(options.backbone)(options)
+    make = load_backbone(options.backbone)
+    return make(options, features) if options.backbone == "classical" else make(options)

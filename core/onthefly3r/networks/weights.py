@@ -40,16 +40,18 @@ def local_weights(name: str) -> Path | None:
     return next((path for path in candidates if path.exists()), None)
 
 
-def find_weights(name: str, chosen: str | None, get_them: str, hub_files: Sequence[str] = FILE_NAMES) -> Weights:
+def find_weights(
+    name: str, chosen: str | None, get_them: str, hub_files: Sequence[str] = FILE_NAMES, option: str = "--weights"
+) -> Weights:
     """Find the weights of model `name`: a path, `owner/name@revision` of the hub, or the weights folder.
 
-    Raises `OptionError` with `get_them` (a sentence) when there are none.
+    Raises `OptionError` with `get_them` (a sentence) when there are none; `option` is what names them.
     """
     if chosen is None:
         path = local_weights(name)
         if path is None:
             raise OptionError(
-                f"{name}: no weights. {get_them} Then give --weights PATH, "
+                f"{name}: no weights. {get_them} Then give {option} PATH, "
                 f"or put the file at {weights_folder() / (name + '.safetensors')}."
             )
         return _at_path(path)

@@ -1,4 +1,4 @@
-"""The embedded retrieval descriptor: VLAD over the RootSIFT features of the backbone, no download."""
+"""The embedded retrieval descriptor: VLAD over RootSIFT features, no download."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class VladDescriber:
     """
 
     def __init__(self, features_of: Callable[[int, WorkingImage], Features], seed: int = 0) -> None:
-        self._features_of = features_of
+        self.features_of = features_of
         self._seed = seed
         self._words: Float | None = None  # (WORDS, 128)
 
@@ -33,7 +33,7 @@ class VladDescriber:
         per_image = max(1, TRAINING_FEATURES // max(len(images), 1))
         samples = []
         for index in images:
-            vectors = _unit(self._features_of(index, images[index]).descriptors)
+            vectors = _unit(self.features_of(index, images[index]).descriptors)
             samples.append(vectors[rng.permutation(len(vectors))[:per_image]])
         training = np.vstack(samples) if samples else np.zeros((0, 128), np.float32)
         if len(training) < WORDS:  # next to no texture: any words do, retrieval will find nothing either way
@@ -48,7 +48,7 @@ class VladDescriber:
         """Return the L2-normalised descriptor (8192,) float32; zeros for an image without features."""
         if self._words is None:
             raise RuntimeError("describe() before fit()")
-        vectors = _unit(self._features_of(index, image).descriptors)
+        vectors = _unit(self.features_of(index, image).descriptors)
         if len(vectors) == 0:
             return np.zeros(WORDS * 128, np.float32)
         # Nearest word by |v - w|^2 = 1 - 2 v.w + |w|^2.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,8 @@ from ..networks import efficientnet
 from ..networks.torch_tools import imagenet_normalised, quiet_upstream, select_device, to_numpy
 from ..networks.weights import find_weights, load_strict, read_state
 from ..records import WorkingImage
-from .base import Describer
 
-NETWORK_SHARE = 0.5  # weight beside local features: more costs precision on real surveys (docs/backbones.md)
+WEIGHTS_OPTION = "--descriptor-weights"
 GEM_POWER = 3.0
 SQUARE_PX = 322
 
@@ -104,9 +103,8 @@ class MegaLocDescriber(NetworkDescriber):
 
     def __init__(self, weights: str | None, device: str = "auto") -> None:
         super().__init__(device)
-        found = find_weights(
-            self.name, weights, "Download model.safetensors of https://huggingface.co/gberton/MegaLoc."
-        )
+        get_them = "Download model.safetensors of https://huggingface.co/gberton/MegaLoc."
+        found = find_weights(self.name, weights, get_them, option=WEIGHTS_OPTION)
         with quiet_upstream():
             from megaloc_model import MegaLoc
 
@@ -131,7 +129,8 @@ class SupSceneDescriber(NetworkDescriber):
 
     def __init__(self, weights: str | None, device: str = "auto") -> None:
         super().__init__(device)
-        found = find_weights(self.name, weights, "Download dinov2_scpp_supscene_1536.pth from the project's releases.")
+        get_them = "Download dinov2_scpp_supscene_1536.pth from the project's releases."
+        found = find_weights(self.name, weights, get_them, option=WEIGHTS_OPTION)
         package = importlib.util.find_spec("supscene")
         checkout = Path(str(package.origin)).parents[1] if package else Path()
         import torch
@@ -149,29 +148,6 @@ class SupSceneDescriber(NetworkDescriber):
     def forward(self, image: WorkingImage) -> Any:
         """Run the network at 322 x 322 px."""
         return self._network(imagenet_normalised(self._tensor(image, SQUARE_PX, SQUARE_PX, "BICUBIC")))[0]
-
-
-class ConcatenatedDescriber:
-    """Several descriptors side by side; a similarity is the mean of theirs weighted by the squared shares."""
-
-    def __init__(self, parts: Sequence[tuple[Describer, float]]) -> None:
-        self._parts = tuple(parts)
-
-    def fit(self, images: Mapping[int, WorkingImage]) -> None:
-        """Fit every part."""
-        for describer, _ in self._parts:
-            describer.fit(images)
-
-    def describe(self, index: int, image: WorkingImage) -> Float:
-        """Return the concatenation (sum of D,) float32 of length 1."""
-        return _unit(np.concatenate([share * describer.describe(index, image) for describer, share in self._parts]))
-
-
-def strengthened(describer: Describer, device: str = "auto") -> Describer:
-    """Return a descriptor of local features joined by EfficientNet-Lite0 where its packages are installed."""
-    if any(importlib.util.find_spec(package) is None for package in EfficientNetDescriber.packages):
-        return describer
-    return ConcatenatedDescriber([(describer, 1.0), (EfficientNetDescriber(device), NETWORK_SHARE)])
 
 
 def _unit(vector: Float) -> Float:
