@@ -32,7 +32,7 @@ LAYERS = (
     {"export"},
     {"simulate"},
     {"engine", "products"},
-    {"run"},
+    {"run", "check"},
     {"batch"},
     {"demo", "doctor", "viewer"},
     COMMAND_LINE,

@@ -1,4 +1,4 @@
-"""The command line: run, export, evaluate, simulate, demo, doctor, view.
+"""The command line: run, batch, check, export, evaluate, simulate, demo, doctor, view.
 
 Exit codes: 0 done, 2 the input is wrong, 3 nothing reconstructed or georeferenced, 130 cancelled, 1 unexpected.
 """
@@ -17,7 +17,7 @@ from .console import columns, session, use_utf8
 from .errors import InputError
 from .evaluate.run import CloudAlign
 from .evaluate.trajectory import Align
-from .options import check
+from .options import check as check_options
 from .protocol import Job
 from .simulate.flight import SurveyOptions
 
@@ -72,6 +72,59 @@ def run(
         for warning in result.report.get("warnings", ()):
             here.warning(warning)
         here.reporter.result(_result_data(result), columns(_result_summary(result)))
+
+
+@app.command()
+@with_run_options()
+def batch(
+    flights: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FLIGHTS",
+            help="folder whose sub-folders are flights, or a CSV with the columns photos, name, options",
+        ),
+    ],
+    out: Out,
+    skip_done: Annotated[
+        bool, typer.Option("--skip-done", help="leave flights alone that were done before", show_default=False)
+    ] = False,
+    json: JsonLines = False,
+    **values: Any,
+) -> None:
+    """Reconstruct many flights, each into a folder of its own in OUT; one that fails does not stop the others."""
+    with session(json_lines=json, out=out) as here:
+        options = run_options(values)
+        from .batch import read_flights, reconstruct_flights
+
+        rows = reconstruct_flights(read_flights(flights), out, options, skip_done, here.progress, here.cancelled)
+        data = {"table": str(out / "flights.csv"), "flights": [asdict(row) for row in rows]}
+        here.reporter.result(data, columns({row.flight: f"{row.status} {row.message}".strip() for row in rows}))
+
+
+@app.command()
+@with_run_options()
+def check(
+    photos: Annotated[Path, typer.Argument(metavar="PHOTOS", help="folder of photographs")],
+    out: Out,
+    above_ground_m: Annotated[
+        float | None,
+        typer.Option(help="flying height; replaces what the drone states above its take-off", metavar="m", min=0.1),
+    ] = None,
+    json: JsonLines = False,
+    **values: Any,
+) -> None:
+    """Look at photographs before they are processed: positions, overlap, blur, exposure, tags, time and memory."""
+    with session(json_lines=json, out=out) as here:
+        options = run_options(values)
+        _require_folder(photos, "PHOTOS")
+        from .check import check_photographs, write_check
+
+        checked = check_photographs(photos, options, above_ground_m, here.progress, here.cancelled)
+        summary = checked.summary()
+        for warning in summary["warnings"]:
+            here.warning(warning)
+        data = {"check": str(write_check(out, checked)), **summary}
+        here.reporter.result(data, columns({name: str(value) for name, value in data.items() if name != "warnings"}))
 
 
 @app.command()
@@ -147,7 +200,7 @@ def simulate(out: Out, json: JsonLines = False, **values: Any) -> None:
     """Render a made-up survey: photographs with tags in OUT/photos, the truth in OUT/truth."""
     with session(json_lines=json, out=out) as here:
         options = SurveyOptions(**given(values))
-        check(options)
+        check_options(options)
         from .simulate import simulate_survey
 
         survey = simulate_survey(out, options, here.progress)

@@ -56,6 +56,7 @@ class Shot:
     orientation: int = 1  # EXIF orientation of the file; the decoded image is upright
     gps: GpsFix | None = None
     attitude: Attitude | None = None
+    above_takeoff_m: float | None = None  # flying height that the drone states
     warnings: tuple[str, ...] = ()
 
 

@@ -50,6 +50,7 @@ def read_shot(path: Path, name: str, options: IntakeOptions) -> Shot:
         orientation=orientation,
         gps=fix,
         attitude=read_attitude(tags),
+        above_takeoff_m=tags.xmp_number("RelativeAltitude"),
         warnings=tuple(warnings),
     )
 
