@@ -68,6 +68,7 @@ def engine(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeEngine]:
     module = types.ModuleType("onthefly3r.run")
     module.reconstruct = fake.reconstruct  # type: ignore[attr-defined]
     module.export_again = fake.export_again  # type: ignore[attr-defined]
+    module.earlier_options = lambda run: {"vertical": "egm96", "spacing_m": 0.25}  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "onthefly3r.run", module)
     yield fake
 
@@ -132,9 +133,11 @@ def test_paper_preset_reaches_the_engine_and_gives_way(engine: FakeEngine, tmp_p
     assert engine.options == Options.from_flat({"preset": "paper", "max_retries": 2})
 
 
-def test_export_takes_only_its_own_options(engine: FakeEngine, tmp_path: Path) -> None:
+def test_export_takes_only_its_own_options_and_keeps_those_of_the_run(engine: FakeEngine, tmp_path: Path) -> None:
     assert call("export", tmp_path, tmp_path / "again", "--format", "las").exit_code == 0
-    assert engine.options == Options.from_flat({"format": "las"})
+    assert engine.options == Options.from_flat({"format": "las", "vertical": "egm96", "spacing_m": 0.25})
+    assert call("export", tmp_path, tmp_path / "again", "--vertical", "egm2008").exit_code == 0
+    assert engine.options == Options.from_flat({"vertical": "egm2008", "spacing_m": 0.25})
     assert call("export", tmp_path, tmp_path / "again", "--seed-size", "12").exit_code == 2
 
 

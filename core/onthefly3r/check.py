@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .backbones.registry import create_backbone
+from .backbones.features import extract_features, new_extractor
 from .errors import Cancelled, PhotographError
 from .export.atomic import write_text
 from .export.clip import in_ring
@@ -368,15 +368,15 @@ def _flight_warnings(
 
 
 def _estimated_time_s(shots: Sequence[Shot], options: Options) -> float | None:
-    """Time a few photographs on this machine and extrapolate; None for backbones without features of their own."""
-    backbone = create_backbone(options.backbone)
-    features_of = getattr(backbone, "features_of", None)
-    if features_of is None or not shots:
+    """Time a few photographs on this machine and extrapolate; None for neural backbones, which nothing here times."""
+    if not shots or options.backbone.backbone != "classical":
         return None
     sample = shots[:: max(1, len(shots) // TIMED_PHOTOGRAPHS)][:TIMED_PHOTOGRAPHS]
+    extractor = new_extractor(options.backbone.features)
     began = time.perf_counter()
-    for index, shot in enumerate(sample):
-        features_of(index, load_working_image(shot, options.backbone.working_px))
+    for shot in sample:
+        rgb = load_working_image(shot, options.backbone.working_px).rgb
+        extract_features(rgb, options.backbone.features, extractor)
     features_s = (time.perf_counter() - began) / len(sample) / (options.backbone.threads or os.cpu_count() or 1)
     dense = (options.backbone.dense_px / options.backbone.working_px) ** 2 if options.export.cloud else 0.0
     return len(shots) * features_s * (1.0 + SPARSE_FACTOR + DENSE_FACTOR * dense)

@@ -135,12 +135,12 @@ def export(
     json: JsonLines = False,
     **values: Any,
 ) -> None:
-    """Write the files of an earlier run again, with another CRS, format or spacing, into OUT."""
+    """Write the files of an earlier run again into OUT; what is not named stays as it was in that run."""
     with session(json_lines=json, out=out) as here:
-        options = run_options(values)
         _require_folder(result, "RESULT")
-        from .run import export_again
+        from .run import earlier_options, export_again
 
+        options = run_options({**earlier_options(result), **given(values)})
         again = export_again(result, out, options, here.progress)
         here.reporter.result(_result_data(again), columns(_result_summary(again)))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from .mapping.ground import ground_normal
 from .mapping.journal import shot_from_json, shot_to_json
 from .mapping.state import MapState
 from .mapping.store import Store
-from .options import Options
+from .options import Options, slice_classes
 from .products import ExportFrame, write_products
 from .protocol import Progress, ProgressCallback
 from .records import GeoReference, RefusedPhotograph, Rejection, Shot
@@ -130,6 +130,23 @@ def export_again(
     outcome = replace(outcome, shots=dict(zip(sorted(outcome.shots), placed_anew, strict=True)))
     out.mkdir(parents=True, exist_ok=True)
     return _finish(out, out / "work", state, store, outcome, options, stopwatch, progress, None)
+
+
+def earlier_options(run: Path) -> dict[str, Any]:
+    """Return the options of georeferencing and export that an earlier run in `run` was made with, by name.
+
+    Left out are its files: positions stay with the photographs of the run, and a boundary need not be there any more.
+    """
+    path = Path(run) / "report.json"
+    try:
+        if path.stat().st_size > MAX_RUN_FILE_BYTES:
+            raise ValueError(f"larger than {MAX_RUN_FILE_BYTES} bytes")
+        told = json.loads(path.read_text(encoding="utf-8"))["software"]["options"]
+        slices = slice_classes()
+        names = {item.name for name in ("georeference", "export") for item in fields(slices[name])}
+        return {name: told[name] for name in names - {"positions", "boundary", "cloud"} if name in told}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path} is no report of a run ({error}); name the output folder of a run") from error
 
 
 def _finish(
