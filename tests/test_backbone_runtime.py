@@ -85,7 +85,7 @@ def test_everything_fits(weights: Path, capfd: pytest.CaptureFixture[str]) -> No
     model = flat(weights).reconstruct(Subset((0, 1), (2, 3)), images(4), {})
     assert isinstance(model, LocalModel)
     assert set(model.views) == {0, 1, 2, 3}
-    assert model.notes["left_out_for_memory"] == 0.0
+    assert model.left_out == ()
     assert capfd.readouterr().out == ""  # standard output carries events
 
 
@@ -94,7 +94,7 @@ def test_out_of_memory_halves_the_new_images_and_is_remembered(weights: Path) ->
     model = backbone.reconstruct(Subset((0, 1, 2), tuple(range(3, 11))), images(11), {})
     assert isinstance(model, LocalModel)
     assert set(model.views) == {0, 1, 2, 3, 4}  # 3 + 8 and 3 + 4 do not fit, 3 + 2 do
-    assert model.notes["left_out_for_memory"] == 6.0
+    assert model.left_out == (5, 6, 7, 8, 9, 10)
     backbone.reconstruct(Subset((0, 1, 2), tuple(range(3, 11))), images(11), {})
     assert backbone.batches == [11, 7, 5, 5]
 
@@ -118,8 +118,8 @@ def test_other_errors_of_a_network_are_not_taken_for_memory(weights: Path, monke
 
 
 def test_licence_is_said_once(weights: Path, caplog: pytest.LogCaptureFixture) -> None:
-    backbone = flat(weights)
     with caplog.at_level("INFO", logger="onthefly3r.backbones"):
+        backbone = flat(weights)
         for _ in range(2):
             backbone.reconstruct(Subset((0,), (1,)), images(2), {})
     assert [record.getMessage() for record in caplog.records] == ["flat: licence: code MIT; weights MIT"]
@@ -127,12 +127,37 @@ def test_licence_is_said_once(weights: Path, caplog: pytest.LogCaptureFixture) -
     assert backbone.spec.version == "flat.pt"
 
 
+def test_report_knows_the_weights_from_others(weights: Path) -> None:
+    import hashlib
+
+    assert flat(weights).spec.facts() == {
+        "name": "flat",
+        "version": "flat.pt",
+        "licence": "code MIT; weights MIT",
+        "weights": {
+            "file": "flat.pt",
+            "source": "flat.pt",
+            "revision": None,
+            "bytes": weights.stat().st_size,
+            "sha256": hashlib.sha256(weights.read_bytes()).hexdigest(),
+        },
+    }
+
+
+def test_network_that_does_not_fit_at_all_is_told_at_the_start(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(torch.nn.Module, "to", full)
+    with pytest.raises(OptionError, match="network alone does not fit"):
+        flat(weights)
+
+
 def test_device_that_is_not_there(weights: Path) -> None:
     if torch.cuda.is_available():
         pytest.skip("this machine has an NVIDIA GPU")
-    backbone = Flat(BackboneOptions(backbone="flat", weights=str(weights), device="cuda"))
     with pytest.raises(OptionError, match="choose auto or cpu"):
-        backbone.reconstruct(Subset((0,), (1,)), images(2), {})
+        Flat(BackboneOptions(backbone="flat", weights=str(weights), device="cuda"))
 
 
 def test_strict_load_lists_keys(tmp_path: Path) -> None:
@@ -186,7 +211,7 @@ def test_upstream_code_that_lacks_a_package_of_its_own(weights: Path, monkeypatc
 
     monkeypatch.setattr(Flat, "build", build)
     with pytest.raises(MissingDependencyError, match="No module named 'no_such_package_0'"):
-        flat(weights).reconstruct(Subset((0,), (1,)), images(2), {})
+        flat(weights)
 
 
 def test_other_packages_add_backbones_but_cannot_take_our_names(monkeypatch: pytest.MonkeyPatch, weights: Path) -> None:

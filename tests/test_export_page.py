@@ -45,6 +45,18 @@ def test_page_tells_rejections_and_escapes_names() -> None:
     assert "No placed photograph looks alike" in text
 
 
+def test_page_names_weights_licence_and_gpu_memory() -> None:
+    weights = {"file": "model.pt", "source": "a/b", "revision": "1f", "bytes": 1234567, "sha256": "0badcafe"}
+    facts = {"name": "vggt", "version": "a/b@1f", "licence": "no <commercial> use", "weights": weights}
+    memory = {"backbone": {"peak_gpu_mib": 4321.4}, "map": {"peak_rss_mib": 10.0}}
+    run = RunSummary(Options(), "vggt a/b@1f", 3, 3, [], Timing(4.0, 1.0), backbone_facts=facts, stage_memory=memory)
+    words = Words()
+    words.feed(page(build_report(run, 99.0), "flight", preview=False))
+    text = " ".join(words.text)
+    for told in ("no <commercial> use", "a/b@1f: model.pt, 1,234,567 bytes", "0badcafe", "4321 MiB", "99 MiB"):
+        assert told in text
+
+
 def test_page_of_a_failed_run_says_why() -> None:
     report = build_report(
         RunSummary(Options(), "classical 1", 3, 0, [], Timing(4.0, 1.0), error="nothing overlaps"), None

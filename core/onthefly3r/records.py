@@ -139,6 +139,7 @@ class LocalModel:
     metric: bool = False  # local units are metres
     calibrations: Mapping[str, Camera] = field(default_factory=dict)  # per camera key, photograph size
     notes: Mapping[str, float] = field(default_factory=dict)  # figures for the report
+    left_out: tuple[int, ...] = ()  # new images that memory had no room for: not looked at, to be asked for again
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from .export.atomic import write_text
 from .export.clip import read_rings
 from .export.las import CloudSummary
 from .export.page import write_page
-from .export.report import RejectedImage, RunSummary, Timing, build_report, peak_rss_mib, write_report
+from .export.report import RejectedImage, RunSummary, Timing, build_report, write_report
 from .geometry.transforms import Rigid3
 from .intake.folder import read_photographs
 from .intake.images import load_working_image
@@ -32,7 +32,7 @@ from .products import ExportFrame, write_products
 from .protocol import Progress, ProgressCallback
 from .records import GeoReference, RefusedPhotograph, Rejection, Shot
 from .selection.choice import create_describer
-from .stopwatch import Stopwatch
+from .stopwatch import Stopwatch, peak_rss_mib
 
 MAX_RUN_FILE_BYTES = 256 * 1024 * 1024
 PRODUCTS = ("cloud.las", "cloud.laz", "trajectory.csv", "preview.png", "report.json", "report.html")
@@ -59,6 +59,7 @@ class _Outcome:
     retries: dict[int, int]
     refused: Sequence[RefusedPhotograph]
     backbone: str
+    backbone_facts: dict[str, Any]
     details: dict[str, Any]
     warnings: Sequence[str]
 
@@ -101,13 +102,14 @@ def reconstruct(
     engine.add_all(shots)
     engine.finish()
     shutil.rmtree(work / "features", ignore_errors=True)
-    write_text(work / "run.json", json.dumps(_run_to_json(engine, refused), ensure_ascii=False))
+    write_text(work / "run.json", json.dumps(_run_to_json(engine, backbone.spec.facts(), refused), ensure_ascii=False))
     outcome = _Outcome(
         engine.shots,
         engine.rejections,
         engine.retries,
         refused,
         engine.backbone_name,
+        backbone.spec.facts(),
         engine.details(),
         engine.warnings,
     )
@@ -214,6 +216,8 @@ def _finish(
         error=str(failure) if failure else None,
         warnings=outcome.warnings,
         details=outcome.details,
+        backbone_facts=outcome.backbone_facts,
+        stage_memory=stopwatch.memory,
     )
     report = build_report(summary, peak_rss_mib())
     write_report(out / "report.json", report)
@@ -265,9 +269,12 @@ def _rejected(outcome: _Outcome) -> list[RejectedImage]:
     return listed
 
 
-def _run_to_json(engine: Engine, refused: Sequence[RefusedPhotograph]) -> dict[str, Any]:
+def _run_to_json(
+    engine: Engine, backbone_facts: dict[str, Any], refused: Sequence[RefusedPhotograph]
+) -> dict[str, Any]:
     return {
         "backbone": engine.backbone_name,
+        "backbone_facts": backbone_facts,
         "details": engine.details(),
         "warnings": list(engine.warnings),
         "shots": {str(i): shot_to_json(shot) for i, shot in engine.shots.items()},
@@ -296,6 +303,7 @@ def _read_run(path: Path) -> _Outcome:
             retries={int(i): int(n) for i, n in stored["retries"].items()},
             refused=[RefusedPhotograph(r["name"], r["reason"], r["numbers"]) for r in stored["refused"]],
             backbone=str(stored["backbone"]),
+            backbone_facts=dict(stored["backbone_facts"]),
             details=dict(stored["details"]),
             warnings=list(stored["warnings"]),
         )

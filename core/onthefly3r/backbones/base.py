@@ -1,12 +1,13 @@
-"""The contract of a local reconstructor (Phi of Eq. 1) and the registry that finds one by name."""
+"""The contract of a local reconstructor (Phi of Eq. 1)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
 
 from ..geometry.camera import Camera
+from ..networks.weights import Fingerprint
 from ..records import LocalModel, Rejection, Subset, WorkingImage
 
 
@@ -19,6 +20,12 @@ class BackboneSpec:
     licence: str
     confidence_threshold: float  # points below it are not used: confidences differ between models
     has_tokens: bool = False
+    weights: Fingerprint | None = None  # of a neural backbone
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the report says of the backbone, JSON values."""
+        weights = None if self.weights is None else asdict(self.weights)
+        return {"name": self.name, "version": self.version, "licence": self.licence, "weights": weights}
 
 
 class Backbone(Protocol):

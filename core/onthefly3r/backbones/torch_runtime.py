@@ -20,7 +20,6 @@ from ..errors import MissingDependencyError, OptionError
 from ..geometry.camera import Camera
 from ..networks.torch_tools import (
     autocast_dtype,
-    gpu_memory,
     is_out_of_memory,
     limit_gpu_memory,
     quiet_upstream,
@@ -69,8 +68,8 @@ class ModelCard:
 class TorchBackbone(ABC):
     """A frozen 3R network behind the backbone contract; subclasses only convert.
 
-    Raises `MissingDependencyError` or `OptionError` when it is made without code or weights. The network is
-    built and loaded when the first subset comes.
+    Making one builds and loads the network: a run that lacks code, weights or memory ends before it began, with
+    `MissingDependencyError` or `OptionError`.
     """
 
     card: ClassVar[ModelCard]
@@ -82,9 +81,23 @@ class TorchBackbone(ABC):
             raise MissingDependencyError(
                 f"backbone {self.card.name}: {', '.join(missing)} missing; {self.card.install_sentence(missing)}"
             )
-        self._weights = find_weights(self.card.name, options.weights, self.card.weights_source, self.card.weights_files)
-        self._options = options
-        self._network: Any = None
+        weights = find_weights(self.card.name, options.weights, self.card.weights_source, self.card.weights_files)
+        log.warning("%s: licence: %s", self.card.name, self.card.licence)
+        self.spec = BackboneSpec(
+            name=self.card.name,
+            version=weights.label,
+            licence=self.card.licence,
+            confidence_threshold=self.card.confidence_threshold,
+            has_tokens=True,
+            weights=weights.fingerprint(),
+        )
+        self._device = select_device(options.device)
+        limit_gpu_memory(self._device, options.max_gpu_memory_gib)
+        if self._device.type == "cpu" and options.threads:
+            import torch
+
+            torch.set_num_threads(options.threads)
+        self._network = self._load(weights)
         self._most_images: int | None = None  # what fitted into GPU memory after it had run out
 
     @abstractmethod
@@ -99,22 +112,10 @@ class TorchBackbone(ABC):
     def predict(self, network: Any, images: Any) -> Prediction:
         """Run the network on images (1, S, 3, H, W) in 0..1 on its device and convert what it answers."""
 
-    @property
-    def spec(self) -> BackboneSpec:
-        """Name, licence and thresholds."""
-        return BackboneSpec(
-            name=self.card.name,
-            version=self._weights.label,
-            licence=self.card.licence,
-            confidence_threshold=self.card.confidence_threshold,
-            has_tokens=True,
-        )
-
     def reconstruct(
         self, subset: Subset, images: Mapping[int, WorkingImage], calibrations: Mapping[str, Camera]
     ) -> LocalModel | Rejection:
         """Rebuild the subset; when GPU memory runs out, half of the new images are left out and it goes on."""
-        network = self._loaded()
         started_s = time.perf_counter()
         least = 1 if subset.references else 2
         new = subset.new
@@ -123,7 +124,7 @@ class TorchBackbone(ABC):
         while True:
             members = subset.references + new
             canvas = compose([self.prepare(images[index]) for index in members])
-            prediction = self._run(network, canvas)
+            prediction = self._run(canvas)
             if prediction is not None:
                 break
             if len(new) <= least:
@@ -137,24 +138,13 @@ class TorchBackbone(ABC):
             self._most_images = len(subset.references) + len(new)
             log.warning("%s: GPU memory ran out; going on with %d images", self.card.name, self._most_images)
         views = local_views(members, canvas, prediction)
-        notes = {
-            "inference_s": time.perf_counter() - started_s,
-            "left_out_for_memory": float(len(subset.new) - len(new)),
-            **gpu_memory(self._device),
-        }
-        return LocalModel(views, prediction.metric, median_calibrations(views, images, calibrations), notes)
-
-    def _loaded(self) -> Any:
-        if self._network is None:
-            log.warning("%s: licence: %s", self.card.name, self.card.licence)
-            self._device = select_device(self._options.device)
-            limit_gpu_memory(self._device, self._options.max_gpu_memory_gib)
-            if self._device.type == "cpu" and self._options.threads:
-                import torch
-
-                torch.set_num_threads(self._options.threads)
-            self._network = self._load(self._weights)
-        return self._network
+        return LocalModel(
+            views,
+            prediction.metric,
+            median_calibrations(views, images, calibrations),
+            notes={"inference_s": time.perf_counter() - started_s},
+            left_out=subset.new[len(new) :],
+        )
 
     def _load(self, weights: Weights) -> Any:
         try:
@@ -176,7 +166,7 @@ class TorchBackbone(ABC):
                 "give --max-gpu-memory-gib more, or --device cpu"
             ) from error
 
-    def _run(self, network: Any, canvas: Canvas) -> Prediction | None:
+    def _run(self, canvas: Canvas) -> Prediction | None:
         import torch
 
         dtype = autocast_dtype(self._device)
@@ -184,7 +174,7 @@ class TorchBackbone(ABC):
             images = torch.from_numpy(np.ascontiguousarray(np.moveaxis(canvas.rgb, 3, 1)))[None].to(self._device)
             autocast = torch.autocast(self._device.type, dtype, enabled=dtype is not None)
             with torch.inference_mode(), autocast, quiet_upstream():
-                return self.predict(network, images)
+                return self.predict(self._network, images)
         except RuntimeError as error:
             if not is_out_of_memory(error):
                 raise

@@ -57,6 +57,7 @@ def page(report: Mapping[str, Any], title: str, preview: bool) -> str:
     parts += _georeference(report["georeference"])
     parts += _rejected(report["images"]["rejected"])
     parts += _timing(report)
+    parts += _backbone(report["backbone"])
     parts.append("<h2>Options</h2>" + _table([(n, _text(v)) for n, v in report["software"]["options"].items()]))
     version, backbone = report["software"]["version"], report["software"]["backbone"]
     parts.append(f'<p class="note">On-the-Fly3R {escape(version)}, backbone {escape(backbone)}</p></body></html>')
@@ -118,7 +119,21 @@ def _timing(report: Mapping[str, Any]) -> list[str]:
     rows += [(name, f"{_number(seconds, 1)} s") for name, seconds in timing["stages"].items()]
     if peak is not None:
         rows.append(("Most memory", f"{peak:.0f} MiB"))
+    on_gpu = {name: used["peak_gpu_mib"] for name, used in report["memory"]["stages"].items() if "peak_gpu_mib" in used}
+    rows += [(f"Most GPU memory, {name}", f"{used:.0f} MiB") for name, used in on_gpu.items()]
     return ["<h2>Time and memory</h2>", _table(rows)]
+
+
+def _backbone(facts: Mapping[str, Any]) -> list[str]:
+    """Name what made the local models, and under which licence: it may bind what the result is used for."""
+    if not facts:
+        return []
+    rows = [("Name", facts["name"]), ("Licence", facts["licence"])]
+    weights = facts["weights"]
+    if weights:
+        rows.append(("Weights", f"{facts['version']}: {weights['file']}, {weights['bytes']:,} bytes"))
+        rows.append(("SHA-256 of the weights", weights["sha256"]))
+    return ["<h2>Backbone</h2>", _table(rows)]
 
 
 def _table(rows: Sequence[tuple[str, str]]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -51,6 +50,8 @@ class RunSummary:
     error: str | None = None  # why the run ended early
     warnings: Sequence[str] = ()
     details: Mapping[str, Any] = field(default_factory=dict)  # further figures, JSON values
+    backbone_facts: Mapping[str, Any] = field(default_factory=dict)  # name, version, licence, weights
+    stage_memory: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # peaks by stage, MiB
 
 
 def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
@@ -58,6 +59,7 @@ def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
     geo, cloud, timing = run.georeference, run.cloud, run.timing
     report: dict[str, Any] = {
         "software": {"version": __version__, "backbone": run.backbone, "options": run.options.to_flat()},
+        "backbone": dict(run.backbone_facts),
         "images": {
             "given": run.given,
             "placed": run.placed,
@@ -93,7 +95,7 @@ def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
             "backbone_s": timing.backbone_s,
             "own_s": timing.total_s - timing.backbone_s,
         },
-        "memory": {"peak_rss_mib": peak_rss_mib},
+        "memory": {"peak_rss_mib": peak_rss_mib, "stages": dict(run.stage_memory)},
         "error": run.error,
         "warnings": [*run.warnings, *(geo.warnings if geo else ())],
         "details": dict(run.details),
@@ -109,16 +111,6 @@ def write_report(path: Path, report: Mapping[str, Any]) -> None:
         temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace", newline="\n")
 
 
-def peak_rss_mib() -> float | None:
-    """Return the most memory this process has had resident, MiB; None where the system does not tell."""
-    if sys.platform == "win32":
-        return _peak_working_set_mib()
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1024.0**2 if sys.platform == "darwin" else 1024.0)  # bytes on macOS, KiB elsewhere
-
-
 def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
@@ -131,26 +123,3 @@ def _plain(value: Any) -> Any:
     if value is None or isinstance(value, bool | int | str):
         return value
     return str(value)
-
-
-def _peak_working_set_mib() -> float | None:
-    import ctypes
-    from ctypes import wintypes
-
-    class Counters(ctypes.Structure):  # PROCESS_MEMORY_COUNTERS of psapi.h
-        _fields_ = (
-            ("cb", wintypes.DWORD),
-            ("PageFaultCount", wintypes.DWORD),
-            *((name, ctypes.c_size_t) for name in ("PeakWorkingSetSize", "WorkingSetSize")),
-            *((f"Quota{i}", ctypes.c_size_t) for i in range(4)),
-            *((name, ctypes.c_size_t) for name in ("PagefileUsage", "PeakPagefileUsage")),
-        )
-
-    counters = Counters(cb=ctypes.sizeof(Counters))
-    kernel = ctypes.WinDLL("kernel32")  # type: ignore[attr-defined,unused-ignore]
-    kernel.GetCurrentProcess.restype = wintypes.HANDLE
-    query = kernel.K32GetProcessMemoryInfo
-    query.argtypes = (wintypes.HANDLE, ctypes.POINTER(Counters), wintypes.DWORD)
-    if not query(kernel.GetCurrentProcess(), ctypes.byref(counters), counters.cb):
-        return None
-    return float(counters.PeakWorkingSetSize) / 1024.0**2

@@ -49,17 +49,6 @@ def limit_gpu_memory(device: Any, limit_gib: float | None) -> None:
         torch.cuda.set_per_process_memory_fraction(min(1.0, limit_gib * GIB / total), device)
 
 
-def gpu_memory(device: Any) -> dict[str, float]:
-    """Return the peak GPU memory since the last call in GiB, nothing on other devices."""
-    import torch
-
-    if device.type != "cuda":
-        return {}
-    peak = torch.cuda.max_memory_allocated(device) / GIB
-    torch.cuda.reset_peak_memory_stats(device)
-    return {"gpu_peak_gib": peak}
-
-
 def is_out_of_memory(error: BaseException) -> bool:
     """Say whether an error means that a device's memory ran out."""
     import torch

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import json
 import os
@@ -20,12 +21,37 @@ HUB_ID = re.compile(r"(?P<repository>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?"
 
 
 @dataclass(frozen=True)
+class Fingerprint:
+    """Which weights a network ran with: enough to find them again and to know them from others."""
+
+    file: str  # name without folder
+    source: str  # hub id, or the file name again
+    revision: str | None  # of the hub
+    bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True)
 class Weights:
     """A file of weights, and what `config.json` beside it says."""
 
     path: Path
-    label: str  # for the report: file name, or hub id and revision
+    source: str  # hub id, or file name
+    revision: str | None = None  # of the hub
     config: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """File name, or hub id and revision."""
+        return f"{self.source}@{self.revision}" if self.revision else self.source
+
+    def fingerprint(self) -> Fingerprint:
+        """Read the whole file once and return what the report says of it."""
+        digest = hashlib.sha256()
+        with self.path.open("rb") as stream:
+            while block := stream.read(1 << 22):
+                digest.update(block)
+        return Fingerprint(self.path.name, self.source, self.revision, self.path.stat().st_size, digest.hexdigest())
 
 
 def weights_folder() -> Path:
@@ -146,7 +172,7 @@ def _at_path(path: Path) -> Weights:
         if not files:
             raise OptionError(f"weights: {path}: the folder holds none of {', '.join(FILE_NAMES)}")
         path = files[0]
-    return Weights(path, path.name, _config(path.with_name("config.json")))
+    return Weights(path, path.name, config=_config(path.with_name("config.json")))
 
 
 def _config(path: Path) -> dict[str, Any]:
@@ -179,4 +205,4 @@ def _from_hub(repository: str, revision: str, names: Sequence[str]) -> Weights:
         raise
     except Exception as error:  # network, permission and revision errors have no common class
         raise OptionError(f"weights: {repository}@{revision}: cannot be downloaded ({_first_line(error)})") from error
-    return Weights(path, f"{repository}@{revision}", _config(path.with_name("config.json")))
+    return Weights(path, repository, revision, _config(path.with_name("config.json")))
