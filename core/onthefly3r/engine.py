@@ -19,19 +19,22 @@ from .mapping.state import MapState
 from .mapping.store import Store
 from .options import Options
 from .protocol import Progress, ProgressCallback
-from .records import LocalModel, Rejection, Shot, Submap, Subset, WorkingImage
+from .records import GpsFix, LocalModel, Rejection, Shot, Submap, Subset, WorkingImage
 from .registration.contextual import incompatible_references
 from .registration.references import scene_spacing
 from .selection.base import Describer
 from .selection.index import RetrievalIndex
-from .selection.proposals import plane_positions, propose_references
+from .selection.proposals import plane_position, propose_references
+from .selection.retry import RetryQueue
 from .selection.seed import choose_seed
-from .selection.subset import build_subset
+from .selection.subset import build_subset, fixed_subset
 from .stopwatch import Stopwatch
 
 SEED_ATTEMPTS = 5
 MIN_SEED_SHARE = 0.5
-OPTIMISE_EVERY = 20  # submaps
+# Drift is removed whenever the map has grown by so many submaps, or by this share: the work stays linear.
+OPTIMISE_EVERY = 20
+OPTIMISE_GROWTH = 0.1
 
 
 class Engine:
@@ -60,7 +63,6 @@ class Engine:
         self.options = options
         self.shots: dict[int, Shot] = {}
         self.rejections: dict[int, Rejection] = {}
-        self.retries: dict[int, int] = {}
         self.stopwatch = Stopwatch()
         self.store = Store(work)
         self.state = MapState(self.store)
@@ -76,15 +78,22 @@ class Engine:
         self._index = RetrievalIndex()
         self._pending: list[int] = []  # described only once there are enough to learn from
         self._waiting: list[int] = []
-        self._set_aside: dict[int, int] = {}  # rejected image -> size of the map when it was
+        self._retry = RetryQueue(options.registration.max_retries)
         self._refused_seeds: set[int] = set()
         self._described = False
+        self._origin: GpsFix | None = None
+        self._optimised_submaps = 0
         self._solver: PoseGraphSolver | None = None
 
     @property
     def backbone_name(self) -> str:
         """Name and version of the local reconstructor."""
         return f"{self._backbone.spec.name} {self._backbone.spec.version}"
+
+    @property
+    def retries(self) -> dict[int, int]:
+        """How often each image was rejected that ever was."""
+        return self._retry.attempts
 
     def details(self) -> dict[str, float]:
         """Return figures of the run for the report."""
@@ -144,7 +153,10 @@ class Engine:
                 self._describer.fit({i: self._images[i] for i in self._pending[:seed_size]})
                 self._described = True
             for index in self._pending:
-                self._index.add(index, self._describer.describe(index, self._images[index]))
+                fix = self.shots[index].gps
+                self._origin = self._origin or fix
+                position = plane_position(fix, self._origin) if fix and self._origin else None
+                self._index.add(index, self._describer.describe(index, self._images[index]), position)
         self._waiting += self._pending
         self._pending = []
 
@@ -154,12 +166,14 @@ class Engine:
         if not self.state.frames and not self._start(finishing):
             return
         while True:
-            if not self._waiting:
-                self._bring_back(finishing)
-            enough = finishing or len(self._waiting) >= self.options.selection.batch_size
-            if not self._waiting or not enough:
+            self._waiting = self._retry.take_ready(finishing and not self._waiting) + self._waiting
+            if not self._waiting or not (finishing or len(self._waiting) >= self.options.selection.batch_size):
                 return
-            self._step()
+            subset = self._next_subset()
+            full = len(subset.new) >= self.options.selection.batch_size
+            if not (finishing or full or len(self._waiting) >= self.options.selection.lookahead):
+                return  # images that fill the batch may still arrive
+            self._step(subset)
             self._checkpoint("reconstructing", len(self.state.frames), len(self.shots))
 
     def _start(self, finishing: bool) -> bool:
@@ -168,10 +182,9 @@ class Engine:
         while self._waiting and (finishing or len(self._waiting) >= size):
             if len(self._refused_seeds) >= SEED_ATTEMPTS and not finishing:
                 return False
-            affinity = self._index.similarities(self._waiting, self._waiting)
             # Attempts after the first few are smaller: a small group may hang together where a large one does not.
             wanted = size if len(self._refused_seeds) < SEED_ATTEMPTS else max(5, size // 3)
-            seed = choose_seed(self._waiting, affinity, wanted, frozenset(self._refused_seeds))
+            seed = choose_seed(self._waiting, self._index.similarities, wanted, frozenset(self._refused_seeds))
             if len(seed) < 3 or len(self._refused_seeds) > 3 * SEED_ATTEMPTS:
                 for index in self._waiting:
                     self._reject((index,), "seed", "no group of images hangs together", {})
@@ -179,6 +192,7 @@ class Engine:
                 return False
             self._checkpoint("starting the map", 0, len(self.shots))
             if self._commit_seed(seed):
+                self._waiting = [i for i in self._waiting if i not in self.state.frames]
                 return True
             self._refused_seeds.add(seed[0])
         return False
@@ -198,8 +212,9 @@ class Engine:
         self._commit(model, Submap(0, Sim3(), (), ()), good)
         return True
 
-    def _step(self) -> None:
-        subset = self._next_subset()
+    def _step(self, subset: Subset) -> None:
+        taken = set(subset.new)
+        self._waiting = [i for i in self._waiting if i not in taken]
         if len(subset.references) < self.options.registration.min_references:
             numbers = {"references": float(len(subset.references))}
             self._set_aside_images(Rejection(subset.new, "retrieval", "no similar images in the map", numbers))
@@ -211,34 +226,29 @@ class Engine:
             return
         self.pruned_references += len(outcome.pruned)
         number = self.state.next_submap()
-        previous = self.state.accepted[-1]
+        previous = self.state.last_accepted(1)[0]
         extra = frame_edges(model, outcome, previous, self.state) if self.options.pose_graph.pose_graph == "se3" else ()
         submap = Submap(number, outcome.alignment.map_from_local, (), outcome.edges, extra)
         self.batch_sizes.append(len(outcome.accepted))
         self._commit(model, submap, outcome.accepted)
         for refused in outcome.refused:
             self._set_aside_images(refused)
-        if (number + 1) % OPTIMISE_EVERY == 0 and self.options.pose_graph.pose_graph == "sim3":
+        grown = number + 1 - self._optimised_submaps
+        if grown >= max(OPTIMISE_EVERY, OPTIMISE_GROWTH * number) and self.options.pose_graph.pose_graph == "sim3":
             self._optimise()
 
     def _next_subset(self) -> Subset:
+        options = self.options.selection
         with self.stopwatch.stage("retrieval"):
-            options = self.options.selection
-            window = self._waiting[: max(options.lookahead, options.batch_size)]
-            neighbours = propose_references(
-                window,
-                self.state.accepted,
-                self._index,
-                plane_positions(self.shots) if options.gps_candidates else {},
-                options.references,
-                options.gps_candidates,
-            )
+            if options.batching == "fixed":
+                return fixed_subset(self._waiting, self.state.last_accepted(options.subset_references), options)
+            window = self._waiting[: options.batch_size]
+            if options.lookahead > 1:
+                window = self._index.best_tied(self._waiting, max(options.lookahead, options.batch_size))
+            neighbours = propose_references(window, self._index, options.references, options.gps_candidates)
             similarity = self._index.similarities(window, window)
             row = {index: i for i, index in enumerate(window)}
-            subset = build_subset(window, neighbours, lambda a, b: float(similarity[row[a], row[b]]), options)
-        taken = set(subset.new)
-        self._waiting = [i for i in self._waiting if i not in taken]
-        return subset
+            return build_subset(window, neighbours, lambda a, b: float(similarity[row[a], row[b]]), options)
 
     def _reconstruct_and_register(self, subset: Subset) -> tuple[Registration | Rejection, LocalModel | None]:
         """Infer, register and validate; with context tokens, drop incompatible references and infer once more."""
@@ -273,11 +283,11 @@ class Engine:
             frames = [new_frame(i, submap.number, model.views[i], self._images[i], threshold, points) for i in accepted]
             complete = replace(submap, frames=tuple(new.frame for new in frames))
             self.state.commit(complete, frames, model.calibrations)
-        placed = {new.frame.index for new in frames}
-        self._waiting = [i for i in self._waiting if i not in placed]
+        placed = [new.frame.index for new in frames]
         for index in placed:
             self.rejections.pop(index, None)
-            self._set_aside.pop(index, None)
+        self._index.accept(placed)
+        self._retry.placed(placed, self._index)
 
     # ------------------------------------------------------------------ rejection and retry
 
@@ -285,22 +295,11 @@ class Engine:
         """Keep rejected images for later: the map may grow around them."""
         self._reject(rejection.images, rejection.stage, rejection.reason, rejection.numbers)
         for index in rejection.images:
-            self.retries[index] = self.retries.get(index, 0) + 1
-            self._set_aside[index] = len(self.state.frames)
+            self._retry.set_aside(index, self._index, self.options.selection.references)
 
     def _reject(self, images: tuple[int, ...], stage: str, reason: str, numbers: Mapping[str, float]) -> None:
         for index in images:
             self.rejections[index] = Rejection((index,), stage, reason, numbers)
-
-    def _bring_back(self, finishing: bool) -> None:
-        """Queue set-aside images again: while images arrive once the map has grown by a batch, at the end by any."""
-        growth = 1 if finishing else self.options.selection.batch_size
-        size = len(self.state.frames)
-        limit = self.options.registration.max_retries
-        ready = [i for i, then in self._set_aside.items() if size >= then + growth and self.retries[i] <= limit]
-        for index in sorted(ready, key=lambda i: (self.retries[i], i)):
-            del self._set_aside[index]
-            self._waiting.append(index)
 
     # ------------------------------------------------------------------ drift
 
@@ -309,6 +308,7 @@ class Engine:
         if kind == "none" or len(self.state.map_from_submap) < 2:
             return
         with self.stopwatch.stage("pose graph"):
+            self._optimised_submaps = len(self.state.map_from_submap)
             self._solver = self._solver or default_solver()
             if kind == "sim3":
                 optimise_submaps(self.state, self._solver)

@@ -58,6 +58,13 @@ class SelectionOptions:
     """Seed, retrieval and dynamic subsets (paper Sec. III-B and III-C)."""
 
     seed_size: int = option(30, "images of the first joint reconstruction (N0)", unit="images", minimum=3)
+    batching: Literal["dynamic", "fixed"] = option(
+        "dynamic",
+        "dynamic builds subsets by retrieval; fixed takes the images as they arrive, with the last placed ones as "
+        "references (the paper's ablation)",
+        choices=("dynamic", "fixed"),
+        advanced=True,
+    )
     batch_size: int = option(5, "most new images in one subset (B_max)", unit="images", minimum=1)
     references: int = option(5, "references retrieved per image (k_r)", unit="images", minimum=3)
     subset_references: int = option(8, "most references in one subset (R_k)", unit="images", minimum=3)

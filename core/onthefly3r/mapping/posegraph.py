@@ -57,7 +57,7 @@ def optimise_frames(state: MapState, solver: PoseGraphSolver) -> None:
     """Move only the camera poses (the paper's graph, Eq. 15-16 on SE(3)); cloud and references stay."""
     nodes = {index: state.map_from_cam(index) for index in state.frames}
     if state.frame_edges:
-        state.move_frames(solver.solve_se3(nodes, state.frame_edges, fixed=state.accepted[0]))
+        state.move_frames(solver.solve_se3(nodes, state.frame_edges, fixed=next(iter(state.frames))))
 
 
 def has_loops(n_nodes: int, edges: Sequence[Edge]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import islice
 
 from ..errors import InputError
 from ..geometry.camera import Camera
@@ -47,10 +48,9 @@ class MapState:
                 raise InputError(f"the journal's entry {kind!r} is damaged ({error!r}); run again") from error
         return state
 
-    @property
-    def accepted(self) -> list[int]:
-        """A_k: shot indices in the order of their acceptance."""
-        return list(self.frames)
+    def last_accepted(self, count: int) -> list[int]:
+        """Return the last frames of A_k in the order of their acceptance."""
+        return list(islice(reversed(self.frames), count))[::-1]
 
     def next_submap(self) -> int:
         """Return the number that the next committed batch gets."""

@@ -2,41 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from ..geometry.arrays import Float
 
 CONNECTING_NEIGHBOURS = 5
+MAX_STARTS = 200  # of many images, so many evenly spread ones are looked at as starts
 
 
-def choose_seed(candidates: Sequence[int], affinity: Float, size: int, avoid: frozenset[int]) -> tuple[int, ...]:
+def choose_seed(
+    candidates: Sequence[int],
+    similarities: Callable[[Sequence[int], Sequence[int]], Float],
+    size: int,
+    avoid: frozenset[int],
+) -> tuple[int, ...]:
     """Return up to `size` candidates that are mutually similar, in the order in which they joined.
 
     The blob starts at the image whose nearest neighbours are most similar to it and always takes the image most
-    similar to what it holds already, so that it covers crossing strips rather than one line of flight.
+    similar to what it holds already, so that it covers crossing strips rather than one line of flight. Empty when
+    every start was tried before.
 
     Args:
         candidates: shot indices.
-        affinity: (N, N) similarities of the candidates (Eq. 4, with whatever position adds).
+        similarities: (first, second) -> similarities (Eq. 4) of all pairs.
         size: N0.
         avoid: starts that were tried before and refused.
     """
-    similarity = np.array(affinity, float)
-    np.fill_diagonal(similarity, -np.inf)
+    starts = [i for i, candidate in enumerate(candidates) if candidate not in avoid]
+    if not starts:
+        return ()
     neighbours = min(CONNECTING_NEIGHBOURS, len(candidates) - 1)
     if neighbours < 1:
         return tuple(candidates)
-    density = np.sort(similarity, axis=1)[:, -neighbours:].mean(axis=1)
-    density[[i for i, c in enumerate(candidates) if c in avoid]] = -np.inf
-    chosen = [int(np.argmax(density))]
-    if not np.isfinite(density[chosen[0]]):
-        return ()
+    if len(starts) > MAX_STARTS:
+        starts = [starts[i] for i in np.linspace(0, len(starts) - 1, MAX_STARTS).astype(int)]
+    affinity = similarities([candidates[i] for i in starts], candidates)
+    affinity[np.arange(len(starts)), starts] = -np.inf
+    density = np.partition(affinity, -neighbours, axis=1)[:, -neighbours:].mean(axis=1)
+    chosen = [starts[int(np.argmax(density))]]
+    links = np.zeros((len(candidates), neighbours))  # the best ones of each candidate to the blob
     while len(chosen) < min(size, len(candidates)):
-        links = np.sort(similarity[:, chosen], axis=1)[:, -neighbours:]
+        new = similarities(candidates, [candidates[chosen[-1]]])
+        links = np.sort(np.column_stack([links, new]), axis=1)[:, 1:]
         # Few links count less: an image must hang on several members, not on one.
-        attraction = np.maximum(links, 0.0).sum(axis=1)
+        attraction = links.sum(axis=1)
         attraction[chosen] = -np.inf
         chosen.append(int(np.argmax(attraction)))
     return tuple(candidates[i] for i in chosen)

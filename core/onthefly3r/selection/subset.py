@@ -10,6 +10,8 @@ from ..records import Neighbour, Subset
 
 Similarity = Callable[[int, int], float]
 
+STARTS = 8  # best tied images that are tried as the start of a batch
+
 
 def dominant_references(
     batch: Sequence[int], neighbours: Mapping[int, Sequence[Neighbour]], count: int
@@ -34,30 +36,59 @@ def build_subset(
     similarity: Similarity,
     options: SelectionOptions,
 ) -> Subset:
-    """Return the next subset B_k = R_k + Q_k (Eq. 8) from the waiting images, oldest first.
+    """Return the next subset B_k = R_k + Q_k (Eq. 8) from the images of the look-ahead, oldest first.
 
     With a look-ahead of one the batch grows in arrival order and stops at the first image that does not fit, as in
     the paper. A longer look-ahead starts at the image that is best tied to the map and always admits the best
-    fitting image within it, so that shuffled input fills batches too.
+    fitting image within it; of a few such starts the first that fills the batch wins, so that shuffled input fills
+    batches too.
     """
-    window = list(waiting[: options.lookahead]) if options.lookahead > 1 else list(waiting)
-    strict_order = options.lookahead == 1
-    start = window[0] if strict_order else max(window, key=lambda q: (_support(neighbours[q]), -window.index(q)))
-    batch = [start]
-    window.remove(start)
-    while window and len(batch) < options.batch_size:
+    if options.lookahead == 1:
+        batch = _grow(waiting, waiting[0], neighbours, similarity, options)
+    else:
+        best_tied = sorted(waiting, key=lambda q: -_support(neighbours[q]))[:STARTS]
+        batch = []
+        for start in best_tied:
+            grown = _grow(waiting, start, neighbours, similarity, options)
+            if len(grown) > len(batch):
+                batch = grown
+            if len(batch) == options.batch_size:
+                break
+    references = dominant_references(batch, neighbours, options.subset_references)
+    return Subset(references=references, new=tuple(batch))
+
+
+def _grow(
+    window: Sequence[int],
+    start: int,
+    neighbours: Mapping[int, Sequence[Neighbour]],
+    similarity: Similarity,
+    options: SelectionOptions,
+) -> list[int]:
+    """Return the batch that grows around one image by Eq. 6-7."""
+    batch, left = [start], [q for q in window if q != start]
+    while left and len(batch) < options.batch_size:
         dominant = set(dominant_references(batch, neighbours, options.references))
-        if strict_order:
-            best = window[0]
-        else:
-            best = max(window, key=lambda q: _fit(q, batch, dominant, neighbours, similarity))
+        best = left[0]
+        if options.lookahead > 1:
+            best = max(left, key=lambda q: _fit(q, batch, dominant, neighbours, similarity))
         overlap, closeness = _fit(best, batch, dominant, neighbours, similarity)
         if overlap < options.min_shared_references or closeness < options.min_similarity:  # Eq. 7
             break
         batch.append(best)
-        window.remove(best)
-    references = dominant_references(batch, neighbours, options.subset_references)
-    return Subset(references=references, new=tuple(batch))
+        left.remove(best)
+    return batch
+
+
+def fixed_subset(waiting: Sequence[int], accepted: Sequence[int], options: SelectionOptions) -> Subset:
+    """Return the next images as they arrived with the frames placed last: the paper's ablation without Eq. 4-8.
+
+    Args:
+        waiting: shot indices in the order of arrival.
+        accepted: frames of the map in the order of their acceptance; at least the last `subset_references`.
+        options: `batch_size` and `subset_references` count.
+    """
+    return Subset(tuple(accepted[-options.subset_references :]), tuple(waiting[: options.batch_size]))
 
 
 def _support(neighbours: Sequence[Neighbour]) -> float:
