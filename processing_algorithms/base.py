@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,10 @@ from ..plugin.worker import WorkerCancelled, WorkerError, run_job
 ROOT = Path(__file__).resolve().parents[1]
 ICONS = ROOT / "resources" / "icons"
 
+Stages = Mapping[str, tuple[int, int]]
+
 # Where each stage of a run begins and ends on the bar, in per cent; measured on surveys of 20 to 170 photographs.
-STAGES = {
+RUN_STAGES: Stages = {
     "reading photographs": (0, 25),
     "starting the map": (25, 30),
     "reconstructing": (30, 85),
@@ -26,6 +29,7 @@ STAGES = {
     "collecting points": (86, 92),
     "fusing the cloud": (92, 99),
 }
+EXPORT_STAGES: Stages = {"collecting points": (0, 50), "fusing the cloud": (50, 99)}
 
 
 def tr(text: str) -> str:
@@ -36,7 +40,7 @@ def tr(text: str) -> str:
 class FeedbackListener:
     """Passes what the worker tells to a Processing feedback."""
 
-    def __init__(self, feedback: QgsProcessingFeedback, stages: dict[str, tuple[int, int]] = STAGES) -> None:
+    def __init__(self, feedback: QgsProcessingFeedback, stages: Stages) -> None:
         self._feedback = feedback
         self._stages = stages
         self._stage = ""
@@ -63,7 +67,8 @@ class FeedbackListener:
             self._feedback.setProgress(begin + (end - begin) * min(1.0, done / total))
         counts = [(data.get("placed"), tr("placed")), (data.get("rejected"), tr("rejected"))]
         counts_text = ", ".join(f"{count} {word}" for count, word in counts if count)
-        self._feedback.setProgressText(f"{stage} {done}/{total}" + (f" ({counts_text})" if counts_text else ""))
+        text = f"{stage}: {data['message']}" if data.get("message") else f"{stage} {done}/{total}"
+        self._feedback.setProgressText(text + (f" ({counts_text})" if counts_text else ""))
         if stage != self._stage:
             self._stage = stage
             self._feedback.pushInfo(stage)
@@ -76,6 +81,7 @@ class CoreAlgorithm(QgsProcessingAlgorithm):
     TITLE = ""  # in English, translated where it is shown
     HELP = ""
     ICON = "onthefly3r.svg"
+    STAGES: Stages = RUN_STAGES
     needs_environment = True
 
     def createInstance(self) -> CoreAlgorithm:
@@ -119,7 +125,7 @@ class CoreAlgorithm(QgsProcessingAlgorithm):
     def run_core(self, job: Job, feedback: QgsProcessingFeedback) -> dict[str, Any]:
         """Run a job and return the data of its result; raises `QgsProcessingException` with the remedy."""
         try:
-            return run_job(settings.interpreter(), job, FeedbackListener(feedback))
+            return run_job(settings.interpreter(), job, FeedbackListener(feedback, self.STAGES))
         except WorkerCancelled:
             raise QgsProcessingException(tr("Cancelled: the worker and all that it started have ended.")) from None
         except WorkerError as error:

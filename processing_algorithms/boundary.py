@@ -34,7 +34,7 @@ def add_boundary(algorithm: QgsProcessingAlgorithm) -> None:
     add(
         algorithm,
         QgsProcessingParameterFeatureSource(
-            BOUNDARY, tr("Boundary layer"), [QgsProcessing.TypeVectorPolygon], optional=True
+            BOUNDARY, tr("Boundary layer"), [QgsProcessing.SourceType.TypeVectorPolygon], optional=True
         ),
         tr("Points outside its polygons are left out of the cloud. All photographs are used all the same."),
     )

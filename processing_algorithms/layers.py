@@ -5,39 +5,39 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from qgis.core import (
+    Qgis,
     QgsCoordinateReferenceSystem,
     QgsFeature,
     QgsFeatureSink,
     QgsField,
     QgsFields,
     QgsGeometry,
-    QgsMapLayer,
     QgsProcessing,
     QgsProcessingAlgorithm,
     QgsProcessingContext,
     QgsProcessingException,
     QgsProcessingFeedback,
-    QgsProcessingLayerPostProcessorInterface,
     QgsProcessingParameterFeatureSink,
-    QgsProcessingUtils,
-    QgsProject,
-    QgsProviderRegistry,
     QgsVectorLayer,
     QgsWkbTypes,
 )
-from qgis.PyQt.QtCore import QVariant
+from qgis.PyQt.QtCore import QMetaType, QVariant
 
-from .base import ROOT, tr
+from .base import tr
 from .parameters import add
+from .presentation import show
 
-STYLES = ROOT / "resources" / "styles"
 CAMERAS, REJECTED, FOOTPRINTS = "CAMERAS", "REJECTED", "FOOTPRINTS"
 MAX_REPORT_BYTES = 64 * 1024 * 1024
 
-TEXT, REAL, WHOLE, TRUTH = QVariant.String, QVariant.Double, QVariant.Int, QVariant.Bool
+if Qgis.QGIS_VERSION_INT >= 33800:
+    TEXT, REAL = QMetaType.Type.QString, QMetaType.Type.Double
+    WHOLE, TRUTH = QMetaType.Type.Int, QMetaType.Type.Bool
+else:  # fields do not take QMetaType yet
+    TEXT, REAL, WHOLE, TRUTH = QVariant.String, QVariant.Double, QVariant.Int, QVariant.Bool
 CAMERA_FIELDS = (
     *((name, TEXT) for name in ("image", "status", "reason")),
     *((name, REAL) for name in ("x", "y", "z", "omega", "phi", "kappa", "yaw", "pitch", "roll")),
@@ -71,7 +71,7 @@ def make_fields(described: Iterable[tuple[str, Any]]) -> QgsFields:
 
 def add_camera_sinks(algorithm: QgsProcessingAlgorithm) -> None:
     """Add the layers that every run has."""
-    point, polygon = QgsProcessing.TypeVectorPoint, QgsProcessing.TypeVectorPolygon
+    point, polygon = QgsProcessing.SourceType.TypeVectorPoint, QgsProcessing.SourceType.TypeVectorPolygon
     add(
         algorithm,
         QgsProcessingParameterFeatureSink(CAMERAS, tr("Cameras"), point, optional=True),
@@ -107,24 +107,28 @@ def fill_camera_sinks(
     context: QgsProcessingContext,
     feedback: QgsProcessingFeedback,
     run: Path,
+    group: str,
 ) -> dict[str, Any]:
-    """Fill the sinks of `add_camera_sinks` from the files of a run and return their destinations."""
+    """Fill the sinks of `add_camera_sinks` from the files of a run and return their destinations.
+
+    Layers that QGIS loads come into the group.
+    """
     report = read_report(run / "report.json")
     crs = run_crs(report)
     cameras = list(read_rows(run / "cameras.shp", CAMERA_FIELDS))
     placed = [row for row in cameras if row[0]["status"] == "placed"]
     footprints = list(read_rows(run / "footprints.shp", FOOTPRINT_FIELDS))
     sinks = (
-        (CAMERAS, CAMERA_FIELDS, QgsWkbTypes.PointZ, placed, "cameras.qml"),
-        (REJECTED, REJECTED_FIELDS, QgsWkbTypes.PointZ, rejected_rows(report, cameras), "rejected.qml"),
-        (FOOTPRINTS, FOOTPRINT_FIELDS, QgsWkbTypes.Polygon, footprints, "footprints.qml"),
+        (CAMERAS, CAMERA_FIELDS, QgsWkbTypes.Type.PointZ, placed, "cameras.qml"),
+        (REJECTED, REJECTED_FIELDS, QgsWkbTypes.Type.PointZ, rejected_rows(report, cameras), "rejected.qml"),
+        (FOOTPRINTS, FOOTPRINT_FIELDS, QgsWkbTypes.Type.Polygon, footprints, "footprints.qml"),
     )
     results: dict[str, Any] = {}
     for name, fields, geometry, rows, style in sinks:
         if parameters.get(name) in (None, ""):
             continue
         results[name] = fill_sink(algorithm, parameters, context, name, fields, geometry, crs, rows)
-        show(context, results[name], run.name, style)
+        show(context, results[name], group, style)
         feedback.pushInfo(f"{algorithm.parameterDefinition(name).description()}: {len(rows)}")
     return results
 
@@ -150,7 +154,7 @@ def fill_sink(
         feature.setAttributes([values.get(name) for name in names])
         if geometry is not None:
             feature.setGeometry(geometry)
-        if not sink.addFeature(feature, QgsFeatureSink.FastInsert):
+        if not sink.addFeature(feature, QgsFeatureSink.Flag.FastInsert):
             raise QgsProcessingException(algorithm.writeFeatureError(sink, parameters, name))
     del sink  # closes the file
     return destination
@@ -179,7 +183,9 @@ def read_rows(path: Path, described: Iterable[tuple[str, Any]]) -> Iterable[Row]
         row = {
             name: None if _is_null(values.get(name)) else convert[kind](values[name]) for name, kind in kinds.items()
         }
-        yield row, QgsGeometry(feature.geometry())
+        geometry = QgsGeometry(feature.geometry())
+        geometry.convertToSingleType()  # shapefiles do not tell polygons from multipolygons
+        yield row, geometry
 
 
 def rejected_rows(report: dict[str, Any], cameras: Iterable[Row]) -> list[Row]:
@@ -199,82 +205,3 @@ def _is_null(value: Any) -> bool:
 def _truth(value: Any) -> bool:
     """Some versions of GDAL give the shapefile's logical field as text."""
     return value in (True, 1, "T", "t", "Y", "y", "1")
-
-
-class Presentation(QgsProcessingLayerPostProcessorInterface):
-    """Styles a layer that was loaded and puts it into the group of its run; works in the main thread."""
-
-    kept: ClassVar[list[Presentation]] = []  # QGIS holds no reference of its own
-    MOST_KEPT = 200
-
-    def __init__(self, group: str, style: str) -> None:
-        super().__init__()
-        self._group, self._style = group, style
-        Presentation.kept[:] = [*Presentation.kept[1 - self.MOST_KEPT :], self]
-
-    def postProcessLayer(self, layer: QgsMapLayer, context: QgsProcessingContext, feedback: Any) -> None:
-        """Style and group `layer`."""
-        if self._style == "cloud":
-            _colour_cloud(layer)
-        elif self._style:
-            layer.loadNamedStyle(str(STYLES / self._style))
-        layer.triggerRepaint()
-        project = context.project() or QgsProject.instance()
-        group_into(project, layer, self._group)
-
-
-def group_into(project: QgsProject, layer: QgsMapLayer, name: str) -> None:
-    """Move a layer of the project into a group, which is made where it is missing."""
-    root = project.layerTreeRoot()
-    node = root.findLayer(layer.id())
-    if node is None or not name or (node.parent() and node.parent().name() == name):
-        return
-    group = root.findGroup(name) or root.insertGroup(0, name)
-    group.insertChildNode(_place(layer, group), node.clone())
-    node.parent().removeChildNode(node)
-
-
-def _place(layer: QgsMapLayer, group: Any) -> int:
-    """Points above polygons above clouds."""
-    return 0 if isinstance(layer, QgsVectorLayer) and layer.wkbType() != QgsWkbTypes.Polygon else len(group.children())
-
-
-def _colour_cloud(layer: QgsMapLayer) -> None:
-    import qgis.core
-
-    renderer = getattr(qgis.core, "QgsPointCloudRgbRenderer", None)
-    if renderer is not None and hasattr(layer, "setRenderer"):
-        layer.setRenderer(renderer())
-
-
-def show(context: QgsProcessingContext, destination: str, group: str, style: str) -> None:
-    """Give a layer that will be loaded its style and group."""
-    if context.willLoadLayerOnCompletion(destination):
-        context.layerToLoadOnCompletionDetails(destination).setPostProcessor(Presentation(group, style))
-
-
-def load_cloud(context: QgsProcessingContext, feedback: QgsProcessingFeedback, path: str, group: str) -> None:
-    """Ask QGIS to load a point cloud, or say why it cannot."""
-    if "pdal" not in QgsProviderRegistry.instance().providerList():
-        feedback.pushInfo(tr("This QGIS has no reader for LAS files (PDAL): the point cloud is in {}.").format(path))
-        return
-    project = context.project()
-    if project is None:
-        return
-    details = QgsProcessingContext.LayerDetails(
-        tr("Point cloud"), project, "CLOUD", QgsProcessingUtils.LayerHint.PointCloud
-    )
-    details.setPostProcessor(Presentation(group, "cloud"))
-    details.forceName = True
-    context.addLayerToLoadOnCompletion(path, details)
-
-
-def remove_stale_index(cloud: Path) -> None:
-    """Remove what QGIS made beside an earlier cloud: it would be shown instead of the new one."""
-    for stale in (cloud.with_name(f"{cloud.stem}.copc.laz"), cloud.with_name(f"ept_{cloud.stem}")):
-        if stale.is_file():
-            stale.unlink()
-        elif stale.is_dir():
-            import shutil
-
-            shutil.rmtree(stale, ignore_errors=True)

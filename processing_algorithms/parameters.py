@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from qgis.core import (
-    Qgis,
     QgsCoordinateReferenceSystem,
     QgsProcessingAlgorithm,
     QgsProcessingContext,
@@ -17,15 +16,16 @@ from qgis.core import (
     QgsProcessingParameterCrs,
     QgsProcessingParameterDefinition,
     QgsProcessingParameterEnum,
+    QgsProcessingParameterFile,
     QgsProcessingParameterNumber,
     QgsProcessingParameterString,
 )
 
-from ..core.onthefly3r.options import iterate_options
+from ..core.onthefly3r.options import Preset, iterate_options
 from .base import tr
 
 # Names of the parameters that are not options of the core.
-QUALITY, CRS = "QUALITY", "CRS"
+QUALITY, CRS, POSITIONS, PRESET = "QUALITY", "CRS", "POSITIONS", "PRESET"
 
 # The presets set these; whoever names one of them in the advanced parameters overrides the preset.
 QUALITIES: dict[str, dict[str, int]] = {
@@ -34,7 +34,24 @@ QUALITIES: dict[str, dict[str, int]] = {
     "full": {"working_px": 1600, "dense_px": 1000, "features": 8000},
 }
 # With parameters of their own, or of no use in QGIS.
-NOT_SHOWN = {"crs", "boundary", "backbone", "vertical", "positions"}
+NOT_SHOWN = {"crs", "boundary", "backbone", "vertical", "positions", "cloud"}
+AS_BEFORE = "as before"
+# Titles where the option's name alone says too little to somebody who does not know the command line.
+TITLES = {
+    "recursive": "Search sub-folders too",
+    "limit": "Use only the first photographs",
+    "focal_35mm": "Focal length, 35-mm equivalent",
+    "working_px": "Size of the photographs while reconstructing",
+    "dense_px": "Size of the point maps",
+    "threads": "Processor cores",
+    "local": "Map units, no coordinate reference system",
+    "gps_sigma_h_m": "Accuracy of positions, horizontal",
+    "gps_sigma_v_m": "Accuracy of positions, vertical",
+    "format": "Format of the point cloud",
+    "spacing_m": "Distance of points",
+    "min_confidence": "Least confidence of a point, 0 to 1",
+    "stray_filter": "Drop isolated points",
+}
 BACKBONES = ("classical", "da3", "pi3", "pi3x", "vggt", "vggt-omega", "mapanything")
 
 
@@ -42,23 +59,8 @@ def add(algorithm: QgsProcessingAlgorithm, parameter: QgsProcessingParameterDefi
     """Add a parameter with its help."""
     parameter.setHelp(help)
     if advanced:
-        parameter.setFlags(parameter.flags() | advanced_flag())
+        parameter.setFlags(parameter.flags() | QgsProcessingParameterDefinition.Flag.FlagAdvanced)
     algorithm.addParameter(parameter)
-
-
-def advanced_flag():
-    """Return the flag of advanced parameters, which moved in QGIS 3.36."""
-    if hasattr(Qgis, "ProcessingParameterFlag"):
-        return Qgis.ProcessingParameterFlag.Advanced
-    return QgsProcessingParameterDefinition.FlagAdvanced
-
-
-def number_type(integer: bool):
-    """Return the type of number parameters, which moved in QGIS 3.36."""
-    if hasattr(Qgis, "ProcessingNumberParameterType"):
-        types = Qgis.ProcessingNumberParameterType
-        return types.Integer if integer else types.Double
-    return QgsProcessingParameterNumber.Integer if integer else QgsProcessingParameterNumber.Double
 
 
 def add_quality(algorithm: QgsProcessingAlgorithm) -> None:
@@ -85,36 +87,70 @@ def add_backbone(algorithm: QgsProcessingAlgorithm) -> None:
     )
 
 
-def add_crs(algorithm: QgsProcessingAlgorithm) -> None:
-    """Add the target CRS and the height reference."""
+def add_target_crs(algorithm: QgsProcessingAlgorithm, again: bool = False) -> None:
+    """Add the target CRS; `again` for a run that has one already."""
+    empty = tr("that of the run is kept") if again else tr("the UTM zone of the photographs' median position is taken")
     add(
         algorithm,
         QgsProcessingParameterCrs(CRS, tr("Coordinate reference system"), optional=True),
-        tr("Projected, in metres. Left empty, the UTM zone of the photographs' median position is taken."),
+        tr("Projected, in metres. Left empty, {}.").format(empty),
     )
-    item = next(item for _, item in iterate_options() if item.name == "vertical")
+
+
+def add_georeference(algorithm: QgsProcessingAlgorithm, again: bool = False) -> None:
+    """Add the target CRS, the height reference and a position file; `again` for a run that has them already."""
+    add_target_crs(algorithm, again)
+    choices = next(item for _, item in iterate_options() if item.name == "vertical").metadata["choices"]
     add(
         algorithm,
-        words_parameter("VERTICAL", tr("Height reference"), item.metadata["choices"], "auto"),
+        words_parameter(
+            "VERTICAL",
+            tr("Height reference"),
+            (AS_BEFORE, *choices) if again else choices,
+            AS_BEFORE if again else "auto",
+        ),
         tr(
             "What the heights in the photographs refer to; the results keep it. auto decides from the tags and says "
             "so in the report. ellipsoidal: above WGS 84. egm96, egm2008: above mean sea level (geoid)."
         ),
     )
+    add(
+        algorithm,
+        QgsProcessingParameterFile(
+            POSITIONS, tr("Position file"), QgsProcessingParameterFile.Behavior.File, optional=True
+        ),
+        tr(
+            "A text file (geo.txt) that replaces the positions in the photographs: first a line with the CRS, such as "
+            "EPSG:4326, then 'name x y [z] [yaw pitch roll] [accuracies: horizontal vertical]' for each photograph."
+        ),
+        advanced=not again,
+    )
 
 
-def add_options(algorithm: QgsProcessingAlgorithm, slices: Iterable[str] | None = None) -> None:
-    """Add the core's options of some slices (default: all) as advanced parameters; empty means the core's default."""
-    wanted = None if slices is None else set(slices)
-    for slice_name, item in iterate_options():
-        if item.name not in NOT_SHOWN and (wanted is None or slice_name in wanted):
+def add_all_options(algorithm: QgsProcessingAlgorithm) -> None:
+    """Add the core's options that have no parameter of their own, as advanced ones; empty means the core's default."""
+    add(
+        algorithm,
+        words_parameter(PRESET, tr("Defaults"), get_args(Preset), "default"),
+        tr("Whose defaults are taken where nothing is named: ours, or those of the paper that the method is from."),
+        advanced=True,
+    )
+    for _, item in iterate_options():
+        if item.name not in NOT_SHOWN:
             add(algorithm, option_parameter(item), option_help(item), advanced=True)
+
+
+def add_options(algorithm: QgsProcessingAlgorithm, *names: str) -> None:
+    """Add some of the core's options as ordinary parameters."""
+    for _, item in iterate_options():
+        if item.name in names:
+            add(algorithm, option_parameter(item), option_help(item))
 
 
 def option_parameter(item: dataclasses.Field) -> QgsProcessingParameterDefinition:
     """Return the parameter of one option, named like it in capitals."""
     facts, name, kind = item.metadata, item.name.upper(), str(item.type)
-    title = tr(item.name.replace("_", " "))
+    title = tr(TITLES.get(item.name) or plain_title(item.name))
     if facts["unit"]:
         title += f" [{facts['unit']}]"
     if facts["choices"]:
@@ -122,7 +158,9 @@ def option_parameter(item: dataclasses.Field) -> QgsProcessingParameterDefinitio
     if kind == "bool":
         return QgsProcessingParameterBoolean(name, title, defaultValue=item.default)
     if kind.startswith(("int", "float")):
-        parameter = QgsProcessingParameterNumber(name, title, number_type(kind.startswith("int")), optional=True)
+        types = QgsProcessingParameterNumber.Type
+        number = types.Integer if kind.startswith("int") else types.Double
+        parameter = QgsProcessingParameterNumber(name, title, number, optional=True)
         if facts["minimum"] is not None:
             parameter.setMinimum(facts["minimum"])
         if facts["maximum"] is not None:
@@ -131,6 +169,13 @@ def option_parameter(item: dataclasses.Field) -> QgsProcessingParameterDefinitio
         parameter.setDefaultValue(None)
         return parameter
     return QgsProcessingParameterString(name, title, optional=True)
+
+
+def plain_title(name: str) -> str:
+    """Return an option's name as words, without the unit that it ends in."""
+    words = name.split("_")
+    words = words[:-1] if words[-1] in ("m", "px", "deg", "gib") else words
+    return " ".join(["GPS" if word == "gps" else word for word in words]).capitalize().replace("Gps", "GPS")
 
 
 def option_help(item: dataclasses.Field) -> str:
@@ -149,18 +194,29 @@ def words_parameter(name: str, title: str, words: Iterable[str], default: str) -
 
 
 def options_from(
-    algorithm: QgsProcessingAlgorithm, parameters: dict[str, Any], context: QgsProcessingContext
+    algorithm: QgsProcessingAlgorithm,
+    parameters: dict[str, Any],
+    context: QgsProcessingContext,
+    every: bool = False,
 ) -> dict[str, Any]:
-    """Return the core's options by name from an algorithm's parameters: the preset first, named ones over it."""
+    """Return the core's options by name from an algorithm's parameters: the presets first, named ones over them.
+
+    With `every`, those that have the core's default are named too: needed where they replace those of an earlier run.
+    """
     options: dict[str, Any] = {}
+    if algorithm.parameterDefinition(PRESET) is not None:
+        preset = algorithm.parameterAsEnumString(parameters, PRESET, context)
+        options.update({} if preset == "default" else {"preset": preset})
     if algorithm.parameterDefinition(QUALITY) is not None:
         options.update(QUALITIES[algorithm.parameterAsEnumString(parameters, QUALITY, context)])
     for _, item in iterate_options():
         definition = algorithm.parameterDefinition(item.name.upper())
-        if definition is None or item.name == "crs":
+        if definition is None or item.name in ("crs", "boundary"):
             continue
         value = _value(algorithm, definition, parameters, context)
-        if value is not None and value != item.default:
+        if value == AS_BEFORE:
+            continue
+        if value is not None and (value != item.default or every):
             options[item.name] = value
         elif value is not None and parameters.get(definition.name()) is not None:
             options.pop(item.name, None)  # the user named the default, against the preset
@@ -179,7 +235,7 @@ def _value(algorithm, definition, parameters, context) -> Any:
     if isinstance(definition, QgsProcessingParameterNumber):
         if parameters.get(name) in (None, ""):
             return None
-        if definition.dataType() == number_type(integer=True):
+        if definition.dataType() == QgsProcessingParameterNumber.Type.Integer:
             return algorithm.parameterAsInt(parameters, name, context)
         return algorithm.parameterAsDouble(parameters, name, context)
     return algorithm.parameterAsString(parameters, name, context) or None

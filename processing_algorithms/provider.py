@@ -8,10 +8,25 @@ from qgis.PyQt.QtGui import QIcon
 from ..core.onthefly3r import __version__
 from ..plugin import settings
 from .base import ICONS, tr
+from .check_photographs import CheckPhotographs
+from .evaluate import Evaluate
+from .export_cameras import ExportCameras
+from .export_cloud import ExportCloud
+from .georeference import Georeference
 from .reconstruct import ReconstructPhotographs
+from .reconstruct_flights import ReconstructFlights
 from .setup_environment import SetUpEnvironment
 
-ALGORITHMS = (ReconstructPhotographs, SetUpEnvironment)
+ALGORITHMS = (
+    ReconstructPhotographs,
+    ExportCloud,
+    ExportCameras,
+    Georeference,
+    ReconstructFlights,
+    CheckPhotographs,
+    Evaluate,
+    SetUpEnvironment,
+)
 
 
 class OnTheFly3RProvider(QgsProcessingProvider):

@@ -3,87 +3,41 @@
 from __future__ import annotations
 
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 from qgis.core import (
     QgsProcessingContext,
     QgsProcessingException,
     QgsProcessingFeedback,
-    QgsProcessingOutputFile,
-    QgsProcessingOutputHtml,
-    QgsProcessingOutputNumber,
-    QgsProcessingOutputString,
-    QgsProcessingParameterBoolean,
     QgsProcessingParameterFile,
     QgsProcessingParameterFolderDestination,
 )
 
 from ..core.onthefly3r.protocol import Job
-from ..plugin import settings
 from .base import CoreAlgorithm, tr
 from .boundary import add_boundary, boundary_file
-from .layers import (
-    FOOTPRINT_FIELDS,
-    add_camera_sinks,
-    fill_camera_sinks,
-    load_cloud,
-    read_report,
-    read_rows,
-    remove_stale_index,
+from .parameters import (
+    add,
+    add_all_options,
+    add_backbone,
+    add_georeference,
+    add_quality,
+    options_from,
+    require_folder,
 )
-from .parameters import add, add_backbone, add_crs, add_options, add_quality, options_from, require_folder
+from .presentation import remove_stale_index
+from .results import add_run_outputs, hand_over
 
-PHOTOS, OUTPUT, LOAD_CLOUD = "PHOTOS", "OUTPUT", "LOAD_CLOUD"
-
-
-def add_run_outputs(algorithm: CoreAlgorithm) -> None:
-    """Declare the files and numbers that every run gives."""
-    algorithm.addOutput(QgsProcessingOutputFile("CLOUD", tr("Point cloud file")))
-    algorithm.addOutput(QgsProcessingOutputHtml("REPORT", tr("Report")))
-    algorithm.addOutput(QgsProcessingOutputString("CRS_OUT", tr("Coordinate reference system of the results")))
-    for name, title in (
-        ("GIVEN", tr("Photographs given")),
-        ("PLACED", tr("Photographs placed")),
-        ("RMSE_H", tr("Position residuals, horizontal RMS [m]")),
-        ("RMSE_V", tr("Position residuals, vertical RMS [m]")),
-        ("POINTS", tr("Points")),
-        ("SPACING", tr("Mean distance of points [m]")),
-        ("GSD", tr("Ground sampling distance of the photographs [m]")),
-    ):
-        algorithm.addOutput(QgsProcessingOutputNumber(name, title))
+PHOTOS, OUTPUT = "PHOTOS", "OUTPUT"
 
 
-def run_results(run: Path) -> dict[str, Any]:
-    """Return the files and numbers of `add_run_outputs`; what a run lacks is None."""
-    report = read_report(run / "report.json")
-    geo, cloud = report["georeference"] or {}, report["cloud"] or {}
-    sampling = [values["gsd_m"] for values, _ in read_rows(run / "footprints.shp", FOOTPRINT_FIELDS)]
-    return {
-        "CLOUD": str(run / cloud["path"]) if cloud else None,
-        "REPORT": str(run / "report.html"),
-        "CRS_OUT": geo.get("crs", ""),
-        "GIVEN": report["images"]["given"],
-        "PLACED": report["images"]["placed"],
-        "RMSE_H": geo.get("rmse_h_m"),
-        "RMSE_V": geo.get("rmse_v_m"),
-        "POINTS": cloud.get("points"),
-        "SPACING": cloud.get("mean_spacing_m"),
-        "GSD": median(sampling) if sampling and geo else None,
-    }
-
-
-def say_results(results: dict[str, Any], feedback: QgsProcessingFeedback) -> None:
-    """Put what a person wants to know first into the log."""
-    feedback.pushInfo(tr("Placed {PLACED} of {GIVEN} photographs.").format(**results))
-    if results["RMSE_H"] is not None:
-        feedback.pushInfo(
-            tr("Residuals of the positions: {RMSE_H:.2f} m horizontally, {RMSE_V:.2f} m vertically (RMS). ").format(
-                **results
-            )
-            + tr("They are not the accuracy: that needs checkpoints.")
-        )
-    feedback.pushInfo(tr("Report: {REPORT}").format(**results))
+def add_photographs(algorithm: CoreAlgorithm) -> None:
+    """Add the folder of photographs."""
+    add(
+        algorithm,
+        QgsProcessingParameterFile(PHOTOS, tr("Folder of photographs"), QgsProcessingParameterFile.Behavior.Folder),
+        tr("JPEG, PNG or TIFF as they come from the drone; sub-folders are searched. Nothing is written there."),
+    )
 
 
 class ReconstructPhotographs(CoreAlgorithm):
@@ -104,28 +58,17 @@ class ReconstructPhotographs(CoreAlgorithm):
 
     def initAlgorithm(self, config: dict[str, Any] | None = None) -> None:
         """Declare parameters and outputs."""
-        add(
-            self,
-            QgsProcessingParameterFile(PHOTOS, tr("Folder of photographs"), QgsProcessingParameterFile.Folder),
-            tr("JPEG, PNG or TIFF as they come from the drone; sub-folders are searched. Nothing is written there."),
-        )
+        add_photographs(self)
         add_quality(self)
-        add_crs(self)
+        add_georeference(self)
         add_boundary(self)
         add_backbone(self)
-        add_options(self)
-        add(
-            self,
-            QgsProcessingParameterBoolean(LOAD_CLOUD, tr("Load the point cloud"), defaultValue=True),
-            tr("Add the cloud to the project, where this QGIS can read LAS files."),
-            advanced=True,
-        )
+        add_all_options(self)
         add(
             self,
             QgsProcessingParameterFolderDestination(OUTPUT, tr("Output folder")),
             tr("Empty or of an earlier run, whose files are replaced. About 5 MB per photograph while computing."),
         )
-        add_camera_sinks(self)
         add_run_outputs(self)
 
     def checkParameterValues(self, parameters: dict[str, Any], context: QgsProcessingContext) -> tuple[bool, str]:
@@ -147,10 +90,4 @@ class ReconstructPhotographs(CoreAlgorithm):
         remove_stale_index(run / "cloud.laz")
         with boundary_file(self, parameters, context) as boundary:
             self.run_core(Job("run", (str(photos), str(run)), {**options, "boundary": boundary}), feedback)
-        results = run_results(run)
-        settings.save_last_report(results["REPORT"])
-        say_results(results, feedback)
-        layers = fill_camera_sinks(self, parameters, context, feedback, run)
-        if results["CLOUD"] and self.parameterAsBoolean(parameters, LOAD_CLOUD, context):
-            load_cloud(context, feedback, results["CLOUD"], run.name)
-        return {OUTPUT: str(run), **results, **layers}
+        return {OUTPUT: str(run), **hand_over(self, parameters, context, feedback, run)}

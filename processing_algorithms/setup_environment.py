@@ -50,7 +50,7 @@ class SetUpEnvironment(CoreAlgorithm):
             QgsProcessingParameterFile(
                 FOLDER,
                 tr("Folder of the environment"),
-                QgsProcessingParameterFile.Folder,
+                QgsProcessingParameterFile.Behavior.Folder,
                 defaultValue=settings.environment_folder(),
                 optional=True,
             ),

@@ -360,7 +360,7 @@ def _flight_warnings(
     if len(cameras) > 1:
         warnings.append(f"{len(cameras)} cameras or image sizes: each is calibrated apart")
     if refused:
-        warnings.append(f"{len(refused)} files cannot be used")
+        warnings.append(f"files that cannot be used: {len(refused)}")
     return warnings
 
 

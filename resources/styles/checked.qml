@@ -187,6 +187,6 @@
   </renderer-v2>
   <blendMode>0</blendMode>
   <featureBlendMode>0</featureBlendMode>
-  <mapTip>&lt;b>[% "image" %]&lt;/b>&lt;br>[% "reasons" %]</mapTip>
+  <mapTip>&lt;b>[% "image" %]&lt;/b>&lt;br>[% "problems" %]</mapTip>
   <layerGeometryType>0</layerGeometryType>
 </qgis>

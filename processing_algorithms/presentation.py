@@ -1,0 +1,102 @@
+"""How results look in the project: styles, groups, and the point cloud where QGIS can show it; main thread only."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any, ClassVar
+
+from qgis.core import (
+    QgsMapLayer,
+    QgsProcessingContext,
+    QgsProcessingFeedback,
+    QgsProcessingLayerPostProcessorInterface,
+    QgsProcessingUtils,
+    QgsProject,
+    QgsProviderRegistry,
+    QgsVectorLayer,
+    QgsWkbTypes,
+)
+
+from .base import ROOT, tr
+
+STYLES = ROOT / "resources" / "styles"
+
+
+class Presentation(QgsProcessingLayerPostProcessorInterface):
+    """Styles a layer that was loaded and puts it into the group of its run; works in the main thread."""
+
+    kept: ClassVar[list[Presentation]] = []  # QGIS holds no reference of its own
+    MOST_KEPT = 200
+
+    def __init__(self, group: str, style: str) -> None:
+        super().__init__()
+        self._group, self._style = group, style
+        Presentation.kept[:] = [*Presentation.kept[1 - self.MOST_KEPT :], self]
+
+    def postProcessLayer(self, layer: QgsMapLayer, context: QgsProcessingContext, feedback: Any) -> None:
+        """Style and group `layer`."""
+        if self._style == "cloud":
+            _colour_cloud(layer)
+        elif self._style:
+            layer.loadNamedStyle(str(STYLES / self._style))
+        layer.triggerRepaint()
+        project = context.project() or QgsProject.instance()
+        group_into(project, layer, self._group)
+
+
+def group_into(project: QgsProject, layer: QgsMapLayer, name: str) -> None:
+    """Move a layer of the project into a group, which is made where it is missing."""
+    root = project.layerTreeRoot()
+    node = root.findLayer(layer.id())
+    if node is None or not name or (node.parent() and node.parent().name() == name):
+        return
+    group = root.findGroup(name) or root.insertGroup(0, name)
+    group.insertChildNode(_place(layer, group), node.clone())
+    node.parent().removeChildNode(node)
+
+
+def _place(layer: QgsMapLayer, group: Any) -> int:
+    """Points above polygons above clouds."""
+    polygon = QgsWkbTypes.GeometryType.PolygonGeometry
+    on_top = isinstance(layer, QgsVectorLayer) and layer.geometryType() != polygon
+    return 0 if on_top else len(group.children())
+
+
+def _colour_cloud(layer: QgsMapLayer) -> None:
+    import qgis.core
+
+    renderer = getattr(qgis.core, "QgsPointCloudRgbRenderer", None)
+    if renderer is not None and hasattr(layer, "setRenderer"):
+        layer.setRenderer(renderer())
+
+
+def show(context: QgsProcessingContext, destination: str, group: str, style: str) -> None:
+    """Give a layer that will be loaded its style and group."""
+    if context.willLoadLayerOnCompletion(destination):
+        context.layerToLoadOnCompletionDetails(destination).setPostProcessor(Presentation(group, style))
+
+
+def load_cloud(context: QgsProcessingContext, feedback: QgsProcessingFeedback, path: str, group: str) -> None:
+    """Ask QGIS to load a point cloud, or say why it cannot."""
+    if "pdal" not in QgsProviderRegistry.instance().providerList():
+        feedback.pushInfo(tr("This QGIS has no reader for LAS files (PDAL): the point cloud is in {}.").format(path))
+        return
+    project = context.project()
+    if project is None:
+        return
+    details = QgsProcessingContext.LayerDetails(
+        tr("Point cloud"), project, "CLOUD", QgsProcessingUtils.LayerHint.PointCloud
+    )
+    details.setPostProcessor(Presentation(group, "cloud"))
+    details.forceName = True
+    context.addLayerToLoadOnCompletion(path, details)
+
+
+def remove_stale_index(cloud: Path) -> None:
+    """Remove what QGIS made beside an earlier cloud: it would be shown instead of the new one."""
+    for stale in (cloud.with_name(f"{cloud.stem}.copc.laz"), cloud.with_name(f"ept_{cloud.stem}")):
+        if stale.is_file():
+            stale.unlink()
+        elif stale.is_dir():
+            shutil.rmtree(stale, ignore_errors=True)
