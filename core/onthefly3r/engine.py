@@ -13,6 +13,7 @@ from .errors import Cancelled, PhotographError
 from .geometry.transforms import Sim3
 from .intake.cache import ImageCache
 from .mapping.frames import new_frame
+from .mapping.gpsprior import pose_priors, tie_to_positions
 from .mapping.posegraph import PoseGraphSolver, default_solver, optimise_frames, optimise_submaps
 from .mapping.register import Registration, check_seed, frame_edges, register
 from .mapping.state import MapState
@@ -23,6 +24,7 @@ from .records import GpsFix, LocalModel, Rejection, Shot, Submap, Subset, Workin
 from .registration.contextual import incompatible_references
 from .registration.references import scene_spacing
 from .selection.base import Describer
+from .selection.frontier import Frontier
 from .selection.index import RetrievalIndex
 from .selection.proposals import plane_position, propose_references
 from .selection.retry import RetryQueue
@@ -78,6 +80,7 @@ class Engine:
         self._index = RetrievalIndex()
         self._pending: list[int] = []  # described only once there are enough to learn from
         self._waiting: list[int] = []
+        self._frontier = Frontier()
         self._retry = RetryQueue(options.registration.max_retries)
         self._refused_seeds: set[int] = set()
         self._described = False
@@ -157,6 +160,7 @@ class Engine:
                 self._origin = self._origin or fix
                 position = plane_position(fix, self._origin) if fix and self._origin else None
                 self._index.add(index, self._describer.describe(index, self._images[index]), position)
+        self._frontier.add(self._pending, self._index)
         self._waiting += self._pending
         self._pending = []
 
@@ -206,7 +210,8 @@ class Engine:
         refused = check_seed(model.views, threshold) if self.options.registration.validate_queries else {}
         good = [i for i in seed if i in model.views and i not in refused]
         spacing = scene_spacing({i: model.views[i] for i in good}, threshold)
-        if len(good) < max(3, MIN_SEED_SHARE * len(seed)) or not spacing > 0.0:
+        seen = len(seed) - len(model.left_out)
+        if len(good) < max(3, MIN_SEED_SHARE * seen) or not spacing > 0.0:
             return False
         self.state.set_spacing(spacing)
         self._commit(model, Submap(0, Sim3(), (), ()), good)
@@ -244,7 +249,8 @@ class Engine:
                 return fixed_subset(self._waiting, self.state.last_accepted(options.subset_references), options)
             window = self._waiting[: options.batch_size]
             if options.lookahead > 1:
-                window = self._index.best_tied(self._waiting, max(options.lookahead, options.batch_size))
+                ready = self._frontier.ready(self._waiting)
+                window = self._index.best_tied(ready, max(options.lookahead, options.batch_size))
             neighbours = propose_references(window, self._index, options.references, options.gps_candidates)
             similarity = self._index.similarities(window, window)
             row = {index: i for i, index in enumerate(window)}
@@ -255,6 +261,7 @@ class Engine:
         model = self._infer(subset)
         if isinstance(model, Rejection):
             return model, None
+        subset = self._put_back(subset, model.left_out)
         outcome = self._register(model, subset)
         if isinstance(outcome, Rejection) and self._backbone.spec.has_tokens:
             minimum = self.options.registration.min_references
@@ -263,8 +270,14 @@ class Engine:
                 subset = replace(subset, references=tuple(i for i in subset.references if i not in dropped))
                 again = self._infer(subset)
                 if isinstance(again, LocalModel):
+                    subset = self._put_back(subset, again.left_out)
                     return self._register(again, subset), again
         return outcome, model
+
+    def _put_back(self, subset: Subset, left_out: tuple[int, ...]) -> Subset:
+        """Queue the images first in line that memory had no room for; return the subset without them."""
+        self._waiting = [*left_out, *self._waiting]
+        return replace(subset, new=tuple(i for i in subset.new if i not in left_out))
 
     def _infer(self, subset: Subset) -> LocalModel | Rejection:
         self.backbone_calls += 1
@@ -287,6 +300,7 @@ class Engine:
         for index in placed:
             self.rejections.pop(index, None)
         self._index.accept(placed)
+        self._frontier.placed(placed, self._index)
         self._retry.placed(placed, self._index)
 
     # ------------------------------------------------------------------ rejection and retry
@@ -311,7 +325,11 @@ class Engine:
             self._optimised_submaps = len(self.state.map_from_submap)
             self._solver = self._solver or default_solver()
             if kind == "sim3":
-                optimise_submaps(self.state, self._solver)
+                priors = []
+                if self.options.pose_graph.gps_priors:
+                    tie = tie_to_positions(self.state, self.shots, self.options.georeference)
+                    priors = pose_priors(self.state, tie, self.shots) if tie is not None else []
+                optimise_submaps(self.state, self._solver, priors)
             else:
                 optimise_frames(self.state, self._solver)
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 MIB = 1024.0**2
@@ -57,6 +59,11 @@ def peak_rss_mib() -> float | None:
     """Return the most memory this process has had resident, MiB; None where the system does not tell."""
     if sys.platform == "win32":
         return _peak_working_set_mib()
+    if sys.platform == "linux":
+        # What getrusage tells includes what the parent had resident when it started this process.
+        with contextlib.suppress(OSError, StopIteration):
+            lines = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
+            return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024.0
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -129,7 +129,7 @@ class TorchBackbone(ABC):
                 break
             if len(new) <= least:
                 return Rejection(
-                    subset.members,
+                    subset.new,
                     "backbone",
                     "out of memory: not even one new image fits; give --max-gpu-memory-gib more, or --device cpu",
                     {"images": float(len(members)), "height_px": canvas.size[0], "width_px": canvas.size[1]},
