@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from onthefly3r import doctor
 from onthefly3r.backbones import registry
-from onthefly3r.backbones.listing import available_backbones, backbone_rows
+from onthefly3r.backbones.listing import available_backbones, backbones_text
 from onthefly3r.backbones.registry import backbone_targets, create_backbone, load_backbone
-from onthefly3r.backbones.torch_runtime import TorchBackbone
+from onthefly3r.backbones.torch_runtime import ModelCard, TorchBackbone
+from onthefly3r.cli import app
 from onthefly3r.errors import MissingDependencyError, OptionError
 from onthefly3r.networks.weights import find_weights
 from onthefly3r.options import BackboneOptions
@@ -60,12 +64,42 @@ def test_listing_says_what_to_do_next(monkeypatch: pytest.MonkeyPatch, tmp_path:
     assert "CC BY-NC" in rows["pi3"].licence
     assert not rows["vggt"].ready
     assert all(item.next_step for item in rows.values())
-    assert len({len(row) for row in backbone_rows()}) == 1
+    assert (rows["classical"].ready, rows["classical"].state) == (True, "ready")
+    text = backbones_text()
+    assert rows["pi3x"].next_step in text  # on one line: addresses stay whole
+    assert "4.2 GiB (subset of 10 photographs)" in text
+
+
+def test_commands_list_the_same_backbones(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "vggt.safetensors").write_bytes(b"")
+    monkeypatch.setenv("ONTHEFLY3R_WEIGHTS", str(tmp_path))
+    monkeypatch.setattr(ModelCard, "missing_packages", lambda card: [] if card.name == "vggt" else [card.module])
+    shown = CliRunner().invoke(app, ["backbones", "--json"])
+    assert shown.exit_code == 0
+    told = {row["name"]: row for row in json.loads(shown.stdout)["backbones"]}
+    assert told["vggt"] == {
+        "name": "vggt",
+        "installed": True,
+        "weights": str(tmp_path / "vggt.safetensors"),
+        "licence": "code VGGT licence (Meta); weights VGGT-1B non-commercial; VGGT-1B-Commercial on request",
+        "memory_gib": 3.6,
+        "next_step": "onthefly3r run PHOTOS OUT --backbone vggt",
+        "ready": True,
+    }
+    assert not told["pi3"]["ready"]
+    assert told["pi3"]["next_step"].startswith("pi3 missing: git clone")
+    human = CliRunner().invoke(app, ["backbones"]).stdout
+    checks = {check.name: check for check in doctor._backbones()}
+    for name, row in told.items():
+        assert f"{name}: " in human
+        assert (checks[f"backbone {name}"].status == "ok") == row["ready"]
+        assert checks[f"backbone {name}"].remedy == ("" if row["ready"] else row["next_step"])
+    assert doctor.is_fit(list(checks.values()))  # nothing that the classical backbone needs
 
 
 def test_listing_loads_no_heavy_package() -> None:
     code = (
-        "import sys; from onthefly3r.backbones.listing import backbone_rows; backbone_rows();"
+        "import sys; from onthefly3r.backbones.listing import backbones_text; backbones_text();"
         "print(sorted({'torch', 'cv2', 'scipy', 'pycolmap', 'PIL'} & set(sys.modules)))"
     )
     core = Path(registry.__file__).parents[2]

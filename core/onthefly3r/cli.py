@@ -236,12 +236,14 @@ def view(
 
 
 @app.command()
-def backbones() -> None:
+def backbones(
+    json: Annotated[bool, typer.Option("--json", help="print one JSON object", show_default=False)] = False,
+) -> None:
     """List the local reconstructors, what each needs here, and what to do next."""
-    from .backbones.listing import print_backbones
+    from .backbones.listing import backbones_json, backbones_text
 
     with session(json_lines=False, polite=False):
-        print_backbones()
+        print(backbones_json() if json else backbones_text())
 
 
 @app.command()
@@ -250,7 +252,7 @@ def doctor(
 ) -> None:
     """Check the interpreter, its packages and the machine, and say how to mend what is missing."""
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
     from rich.text import Text
 
     from .doctor import examine, is_fit, to_json
@@ -259,7 +261,7 @@ def doctor(
     if json:
         print(to_json(checks))
     else:
-        table = Table("", "check", "found", "to mend it", box=None)
+        table = Table("", *(Column(name, overflow="fold") for name in ("check", "found", "to mend it")), box=None)
         for check in checks:
             colour = {"ok": "green", "note": "yellow", "missing": "red"}[check.status]
             table.add_row(Text(check.status, colour), check.name, Text(check.found), Text(check.remedy))

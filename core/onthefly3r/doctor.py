@@ -114,14 +114,14 @@ class Check:
 
 
 def examine(folder: Path) -> list[Check]:
-    """Check the interpreter, every package, PROJ, LAZ, and the machine; `folder` tells which disk is asked."""
+    """Check interpreter, machine, every package, PROJ, LAZ and backbones; `folder` tells which disk is asked."""
     tasks: list[Callable[[], Check]] = [lambda package=package: check_package(package) for package in PACKAGES]  # type: ignore[misc]
     reinstall = "install the package again: pip install --force-reinstall "
     tasks.append(lambda: _check_script("PROJ data", _PROJ, reinstall + "pyproj"))
     tasks.append(lambda: _check_script("LAZ backend", _LAZ, reinstall + '"laspy[lazrs]"'))
     with ThreadPoolExecutor(max_workers=min(4, _cores())) as pool:
         checks = list(pool.map(lambda task: task(), tasks))
-    return [_interpreter(), *_machine(folder), *checks]
+    return [_interpreter(), *_machine(folder), *checks, *_backbones()]
 
 
 def check_package(package: Package) -> Check:
@@ -223,6 +223,20 @@ def _install_command(package: Package) -> str:
     if package.extra:
         return f'pip install "onthefly3r[{package.extra}]"'
     return f"pip install {package.distribution}"
+
+
+def _backbones() -> list[Check]:
+    """Return one line for each backbone; none where a package is missing that listing them needs."""
+    try:
+        from .backbones.listing import available_backbones
+    except ImportError:
+        return []
+    return [
+        Check(f"backbone {item.name}", "ok", item.state)
+        if item.ready
+        else Check(f"backbone {item.name}", "note", item.state, item.next_step)
+        for item in available_backbones()
+    ]
 
 
 def _interpreter() -> Check:

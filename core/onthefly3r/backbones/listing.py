@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass
 
 from ..errors import OnTheFly3RError
 from ..networks.weights import local_weights
@@ -28,30 +29,28 @@ class BackboneDescription:
         """Whether a run with this backbone can start now."""
         return self.installed and self.weights != ""
 
+    @property
+    def state(self) -> str:
+        """Whether it can run, in a word or two."""
+        if not self.installed:
+            return "not installed"
+        return "ready" if self.ready else "weights not found"
+
 
 def available_backbones() -> list[BackboneDescription]:
     """Describe every backbone that options can make; imports adapters but no torch and no upstream code."""
     return [_describe(name) for name in backbone_targets()]
 
 
-def backbone_rows() -> list[tuple[str, ...]]:
-    """Return a header and one row of text per backbone, for any table."""
-    header = ("backbone", "installed", "weights", "GPU memory, 10 images", "licence", "next step")
-    return [header, *(_row(item) for item in available_backbones())]
+def backbones_text() -> str:
+    """Return a paragraph for each backbone; lines are not broken, so that addresses stay whole."""
+    return "\n\n".join(_paragraph(item) for item in available_backbones())
 
 
-def print_backbones() -> None:
-    """Print the table to standard output."""
-    from rich.console import Console
-    from rich.table import Table
-
-    header, *rows = backbone_rows()
-    table = Table(show_lines=True)
-    for title in header:
-        table.add_column(title, overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    Console().print(table)
+def backbones_json() -> str:
+    """Return all of them as one JSON object."""
+    rows = [{**asdict(item), "ready": item.ready} for item in available_backbones()]
+    return json.dumps({"backbones": rows}, ensure_ascii=False)
 
 
 def _describe(name: str) -> BackboneDescription:
@@ -74,7 +73,13 @@ def _describe(name: str) -> BackboneDescription:
     return BackboneDescription(name, not missing, weights, card.licence, card.memory_gib, next_step)
 
 
-def _row(item: BackboneDescription) -> tuple[str, ...]:
-    weights = "none needed" if item.weights is None else item.weights or "not found"
-    memory = "" if item.weights is None else "not published" if item.memory_gib is None else f"{item.memory_gib:g} GiB"
-    return item.name, "yes" if item.installed else "no", weights, memory, item.licence, item.next_step
+def _paragraph(item: BackboneDescription) -> str:
+    lines = [f"{item.name}: {item.state}"]
+    if item.weights:
+        lines.append(f"  weights     {item.weights}")
+    if item.licence:
+        lines.append(f"  licence     {item.licence}")
+    if item.weights is not None:
+        memory = "not published" if item.memory_gib is None else f"{item.memory_gib:g} GiB"
+        lines.append(f"  GPU memory  {memory} (subset of 10 photographs)")
+    return "\n".join([*lines, f"  {'run' if item.ready else 'next'}".ljust(14) + item.next_step])

@@ -19,6 +19,8 @@ from .conventions import (
 )
 from .torch_runtime import ModelCard, TorchBackbone
 
+INSTALL = "pip install --no-deps git+https://github.com/facebookresearch"
+
 
 def prediction(answer: Mapping[str, Any], tokens: Any) -> Prediction:
     """Convert `pose_enc`, `depth` and `depth_conf` of a batch of one; unprojected depth beats the point head."""
@@ -40,7 +42,7 @@ class Vggt(TorchBackbone):
     card = ModelCard(
         name="vggt",
         module="vggt",
-        install="pip install --no-deps git+https://github.com/facebookresearch/vggt, einops, huggingface_hub",
+        install=f"{INSTALL}/vggt; pip install einops huggingface_hub",
         code_licence="VGGT licence (Meta)",
         weights_licence="VGGT-1B non-commercial; VGGT-1B-Commercial on request",
         weights_source="Download model.safetensors or model.pt of https://huggingface.co/facebook/VGGT-1B.",
@@ -80,7 +82,7 @@ class VggtOmega(TorchBackbone):
     card = ModelCard(
         name="vggt-omega",
         module="vggt_omega",
-        install="pip install --no-deps git+https://github.com/facebookresearch/vggt-omega, einops",
+        install=f"{INSTALL}/vggt-omega; pip install einops",
         code_licence="FAIR non-commercial research licence",
         weights_licence="FAIR non-commercial research licence, outputs too; gated",
         weights_source="Ask for vggt_omega_1b_512.pt at https://huggingface.co/facebook/VGGT-Omega and download it.",
