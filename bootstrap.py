@@ -42,6 +42,10 @@ EXTRA_NEED_MIB = {"neural": 6000, "cloud": 1200, "test": 200}
 # saves the gigabytes of GPU libraries where the index offers that build.
 TEST_CONSTRAINTS = "torch==2.13.0\n"
 
+# A model whose adapter is tested on its own code. What it names as dependencies contradicts ours (numpy below 2);
+# what its network really needs is in the extra `test`.
+TEST_MODELS = ('depth-anything-3==0.1.1; python_version < "3.13"',)
+
 Report = Callable[[str], None]
 
 
@@ -75,30 +79,40 @@ def create_environment(
     *,
     source: Path = ROOT,
     constraints: str = "",
+    alone: Iterable[str] = (),
 ) -> Path:
     """Make the environment in `folder`, install the package of `source` with `extras`, return its interpreter.
 
     Returns at once when a stamp in the folder says that this was done already; extras add up. `constraints` are
-    lines of a pip constraints file. Raises `SetupError` with the remedy.
+    lines of a pip constraints file; `alone` are requirements that come without what they depend on. Raises
+    `SetupError` with the remedy.
     """
     folder = Path(folder).absolute()
     python = environment_python(folder)
-    wanted = set(extras)
+    wanted, lone = set(extras), set(alone)
     installed = _read_stamp(folder)
     package = _package_hash(source)
     # An environment stays usable while its own interpreter is the one that it was made with.
     if installed and installed.get("interpreter") == _version_of(python):
-        if installed.get("package") == package and wanted <= set(installed["extras"]):
+        lone_there = set(installed.get("alone", ()))
+        if installed.get("package") == package and wanted <= set(installed["extras"]) and lone <= lone_there:
             return python
-        wanted |= set(installed["extras"])
+        wanted, lone = wanted | set(installed["extras"]), lone | lone_there
     else:
         _make_venv(folder, progress)
     _check_room(folder, wanted)
     (folder / STAMP_NAME).unlink(missing_ok=True)
     named = f"[{','.join(sorted(wanted))}]" if wanted else ""
     progress(f"Installing onthefly3r{named} into {folder}; the first time takes some minutes.")
-    _pip_install(python, f"{source}{named}", constraints, progress)
-    stamp = {"interpreter": _version_of(python), "package": package, "extras": sorted(wanted)}
+    _pip_install(python, ["-e", f"{source}{named}"], constraints, progress)
+    for requirement in sorted(lone):
+        _pip_install(python, ["--no-deps", requirement], constraints, progress)
+    stamp = {
+        "interpreter": _version_of(python),
+        "package": package,
+        "extras": sorted(wanted),
+        "alone": sorted(lone),
+    }
     (folder / STAMP_NAME).write_text(json.dumps(stamp, indent=1), encoding="utf-8")
     return python
 
@@ -172,9 +186,9 @@ def _check_room(folder: Path, extras: Iterable[str]) -> None:
         raise SetupError(f"{folder} has {free} MiB free, and the installation needs about {need} MiB: make room.")
 
 
-def _pip_install(python: Path, requirement: str, constraints: str, progress: Report) -> None:
+def _pip_install(python: Path, wanted: Sequence[str], constraints: str, progress: Report) -> None:
     with tempfile.TemporaryDirectory() as scratch:
-        command = [str(python), "-m", "pip", "install", "--progress-bar", "off", "--no-input", "-e", requirement]
+        command = [str(python), "-m", "pip", "install", "--progress-bar", "off", "--no-input", *wanted]
         if constraints:
             constraint_file = Path(scratch) / "constraints.txt"
             constraint_file.write_text(constraints, encoding="utf-8")
@@ -278,7 +292,7 @@ def run(environment: Path, rest: Sequence[str]) -> int:
 
 def test(environment: Path, rest: Sequence[str]) -> int:
     """Run every check to its end, and return 0 only when all passed."""
-    python = create_environment(environment, TEST_EXTRAS, constraints=TEST_CONSTRAINTS)
+    python = create_environment(environment, TEST_EXTRAS, constraints=TEST_CONSTRAINTS, alone=TEST_MODELS)
     for sentence in missing_system_libraries(python):
         say(f"Tests that need it will be skipped: {sentence}")
     checks: dict[str, list[str | Path]] = {

@@ -52,8 +52,9 @@ class Installer:
         self.python(folder).parent.mkdir(parents=True, exist_ok=True)
         self.python(folder).touch()
 
-    def install(self, python: Path, requirement: str, constraints: str, progress: Any) -> None:
-        self.requirements.append(requirement)
+    def install(self, python: Path, wanted: Sequence[str], constraints: str, progress: Any) -> None:
+        assert wanted[0] in ("-e", "--no-deps")
+        self.requirements.append(wanted[-1] if wanted[0] == "-e" else " ".join(wanted))
         self.constraints.append(constraints)
 
 
@@ -76,6 +77,24 @@ def test_extras_add_up(bootstrap: ModuleType, installer: Installer, source: Path
         bootstrap.create_environment(folder, extras, source=source)
     assert installer.venvs == 1
     assert installer.requirements == [str(source), f"{source}[test]", f"{source}[cloud,test]"]
+
+
+def test_what_comes_without_its_dependencies(
+    bootstrap: ModuleType, installer: Installer, source: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "environment"
+    bootstrap.create_environment(folder, ("test",), source=source)
+    for _ in range(2):
+        bootstrap.create_environment(folder, ("test",), source=source, constraints="torch==1\n", alone=("model==2",))
+    bootstrap.create_environment(folder, ("cloud",), source=source)
+    assert installer.requirements == [
+        f"{source}[test]",
+        f"{source}[test]",
+        "--no-deps model==2",
+        f"{source}[cloud,test]",
+        "--no-deps model==2",
+    ]
+    assert installer.constraints[1:3] == ["torch==1\n"] * 2  # no build of torch but the tested one
 
 
 def test_changed_requirements_are_installed_into_the_same_environment(
@@ -173,7 +192,7 @@ def test_unreachable_index_is_told_by_the_real_pip(bootstrap: ModuleType, monkey
     if importlib.util.find_spec("pip") is None:
         pytest.skip("this interpreter has no pip")
     with pytest.raises(bootstrap.SetupError, match="cannot be reached"):
-        bootstrap._pip_install(Path(sys.executable), str(ROOT), "", lambda line: None)
+        bootstrap._pip_install(Path(sys.executable), ["-e", str(ROOT)], "", lambda line: None)
 
 
 @pytest.mark.parametrize(("listing", "status", "found"), [("GPU 0: some", 0, True), ("", 0, False), ("GPU", 9, False)])
