@@ -68,7 +68,7 @@ class ExportFrame:
         if self.world is None:
             return 0.0
         turn = self.world.rotation_world_from_enu(self.level_from_map.apply(map_from_cam.translation))
-        return float(np.degrees(np.arctan2(turn[0, 1], turn[0, 0])))
+        return float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
 
 
 def write_products(
