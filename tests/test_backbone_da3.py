@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import warnings
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -129,23 +128,6 @@ def test_order_of_the_images_permutes_the_answers(backbone) -> None:
         assert np.abs(view.confidence - other.confidence).max() < 1e-4
         assert np.abs(view.points - other.points).max() < 1e-3 * np.abs(view.points).max()
         assert np.abs(view.tokens - other.tokens).max() < 1e-3 * np.abs(view.tokens).max()
-
-
-def test_sizes_and_grid_from_photo() -> None:
-    from onthefly3r.backbones.da3 import DepthAnything3
-
-    adapter = object.__new__(DepthAnything3)
-    for (width, height), expected in {(600, 400): (504, 336), (602, 451): (504, 378), (451, 602): (378, 504)}.items():
-        image = photograph(0, width, height)
-        u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        dot = 255.0 * np.exp(-((u - 0.3 * width) ** 2 + (v - 0.6 * height) ** 2) / (2 * 5.0**2))
-        image = replace(image, rgb=np.repeat(dot.round().astype(np.uint8)[..., None], 3, axis=2))
-        network = adapter.prepare(image)
-        assert network.rgb.shape[1::-1] == expected
-        weight = network.rgb[..., 0].astype(float)
-        found = [(weight.sum(axis=axis) * (np.arange(expected[axis]) + 0.5)).sum() / weight.sum() for axis in (0, 1)]
-        there = np.array([0.3 * image.shot.width_px, 0.6 * image.shot.height_px])
-        assert found == pytest.approx(network.grid_from_photo.apply(there), abs=0.05)
 
 
 def test_weights_of_a_single_image_model_are_refused(network, tmp_path: Path) -> None:
