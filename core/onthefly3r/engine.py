@@ -24,7 +24,7 @@ from .records import GpsFix, LocalModel, Rejection, Shot, Submap, Subset, Workin
 from .registration.contextual import incompatible_references
 from .registration.references import scene_spacing
 from .selection.base import Describer
-from .selection.frontier import Frontier
+from .selection.frontier import Frontier, orphans
 from .selection.index import RetrievalIndex
 from .selection.proposals import plane_position, propose_references
 from .selection.retry import RetryQueue
@@ -230,6 +230,10 @@ class Engine:
                 self._set_aside_images(outcome)
             return
         self.pruned_references += len(outcome.pruned)
+        outcome = self._without_orphans(outcome, subset)
+        if isinstance(outcome, Rejection):
+            self._set_aside_images(outcome)
+            return
         number = self.state.next_submap()
         previous = self.state.last_accepted(1)[0]
         extra = frame_edges(model, outcome, previous, self.state) if self.options.pose_graph.pose_graph == "se3" else ()
@@ -254,7 +258,8 @@ class Engine:
             neighbours = propose_references(window, self._index, options.references, options.gps_candidates)
             similarity = self._index.similarities(window, window)
             row = {index: i for i, index in enumerate(window)}
-            return build_subset(window, neighbours, lambda a, b: float(similarity[row[a], row[b]]), options)
+            subset = build_subset(window, neighbours, lambda a, b: float(similarity[row[a], row[b]]), options)
+            return subset if options.lookahead == 1 else self._frontier.supported(subset, self._index)
 
     def _reconstruct_and_register(self, subset: Subset) -> tuple[Registration | Rejection, LocalModel | None]:
         """Infer, register and validate; with context tokens, drop incompatible references and infer once more."""
@@ -273,6 +278,18 @@ class Engine:
                     subset = self._put_back(subset, again.left_out)
                     return self._register(again, subset), again
         return outcome, model
+
+    def _without_orphans(self, outcome: Registration, subset: Subset) -> Registration | Rejection:
+        """Refuse the new images whose own references were pruned: nothing kept speaks for where they are."""
+        if not self.options.registration.validate_queries:
+            return outcome
+        least = self.options.selection.min_shared_references
+        lost = [i for i in orphans(subset, outcome.alignment.references, self._index, least) if i in outcome.accepted]
+        refused = [Rejection((i,), "queries", "the references most like it were pruned", {}) for i in lost]
+        accepted = tuple(i for i in outcome.accepted if i not in lost)
+        if not accepted:
+            return Rejection(subset.new, "queries", "the references most like the new images were pruned", {})
+        return replace(outcome, accepted=accepted, refused=(*outcome.refused, *refused))
 
     def _put_back(self, subset: Subset, left_out: tuple[int, ...]) -> Subset:
         """Queue the images first in line that memory had no room for; return the subset without them."""

@@ -16,7 +16,7 @@ from ..records import Subset
 from .index import RetrievalIndex
 
 NEIGHBOURS = 3  # similarities of so many are averaged: fewer references are not enough to register an image
-READY = 0.7  # similarity to the map over similarity to everything seen, from which an image is ready
+READY = 0.8  # similarity to the map over similarity to everything seen, from which an image is ready
 BLOCK = 1000  # rows of similarities at a time
 
 

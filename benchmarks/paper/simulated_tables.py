@@ -1,0 +1,89 @@
+"""The figures of simulated runs and of real photographs as tables: mean over the seeds, and their range."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from onthefly3r.evaluate.trajectory import pose_errors
+
+from .published import ABLATION
+from .results import read_result
+from .simulated import SCENARIOS, pose_file, survey_of, truth
+from .strategies import STRATEGIES
+from .tables import markdown, shown
+
+OURS = "on-the-fly"
+CASES = {f"case-{number}": case for number, case in ABLATION.items()}
+
+
+def strategies_table(rows: Sequence[dict[str, Any]], out: Path, scenario: str) -> str:
+    """Return one line for each strategy that was run on a survey.
+
+    "common" is the ATE on the frames that ours placed; "passes" is the worst ratio of the ATE after a pass of the pose
+    graph to the one before it, over all passes of all seeds.
+    """
+    lines = []
+    for strategy in STRATEGIES:
+        runs = [r for r in rows if r["scenario"] == scenario and r["strategy"] == strategy]
+        if not runs or strategy in CASES:
+            continue
+        common = [_common_ate(out, scenario, strategy, r["seed"]) for r in runs]
+        ratios = [after / before for r in runs for before, after in r["passes"] if before > 0.0]
+        lines.append(
+            [
+                strategy,
+                ", ".join(str(r["seed"]) for r in runs),
+                spread([r["ate"] for r in runs], runs[0]["note"]),
+                spread(common),
+                *(spread([r[key] for r in runs]) for key in ("are_deg", "rte_deg", "rre_deg")),
+                f"{100.0 * sum(r['placed'] for r in runs) / sum(r['given'] for r in runs):.2f}",
+                f"{sum(r['calls'] for r in runs) / len(runs):.0f}",
+                f"{sum(r['inferred'] for r in runs) / sum(r['given'] for r in runs):.2f}",
+                str(max(r["largest"] for r in runs)),
+                f"{max(ratios):.3f} ({len(ratios)})" if ratios else "-",
+            ]
+        )
+    head = ["Strategy", "Seeds", "ATE m", "common", "ARE deg", "RTE deg", "RRE deg", "Coverage %"]
+    return markdown([*head, "Calls", "Inferred / image", "Largest call", "Passes: worst ratio"], lines)
+
+
+def ablation_table(rows: Sequence[dict[str, Any]], scenario: str) -> str:
+    """Return tab:ablation on a simulated survey; in brackets the paper's value for HAV or Residence."""
+    lines = []
+    for name, case in CASES.items():
+        runs = [r for r in rows if r["scenario"] == scenario and r["strategy"] == name]
+        if not runs:
+            continue
+        told = {"HAV": case.hav, "Residence": case.residence}.get(scenario, (None,) * 4)
+        switches = (case.dynamic_batching, case.validation_and_retry, case.pose_graph)
+        keys = ("ate", "are_deg", "rte_deg", "rre_deg")
+        lines.append(
+            [
+                name.removeprefix("case-"),
+                *("yes" if on else "no" for on in switches),
+                *(f"{spread([r[key] for r in runs])} ({shown(t)})" for key, t in zip(keys, told, strict=True)),
+                f"{100.0 * sum(r['placed'] for r in runs) / sum(r['given'] for r in runs):.2f}",
+                ", ".join(str(r["seed"]) for r in runs),
+            ]
+        )
+    head = ["Case", "Dyn.", "V&R", "PGO", "ATE m", "ARE deg", "RTE deg", "RRE deg", "Coverage %", "Seeds"]
+    return markdown(head, lines)
+
+
+def spread(values: Sequence[float | None], otherwise: str = "") -> str:
+    """Return `mean [least, greatest]` of the seeds, or why there is none."""
+    known = [v for v in values if v is not None]
+    if not known:
+        return otherwise.split(":")[0] or "-"
+    middle = sum(known) / len(known)
+    return shown(middle) if len(known) == 1 else f"{shown(middle)} [{shown(min(known))}, {shown(max(known))}]"
+
+
+def _common_ate(out: Path, scenario: str, strategy: str, seed: int) -> float | None:
+    paths = [pose_file(out, scenario, name, seed) for name in (strategy, OURS)]
+    if not all(path.is_file() for path in paths):
+        return None
+    estimate, ours = (read_result(path) for path in paths)
+    return pose_errors(estimate, truth(survey_of(SCENARIOS[scenario], seed)), only=[ours]).ate
