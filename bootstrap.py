@@ -4,7 +4,7 @@
                                                       make FOLDER or .venv and install the package
     python3 bootstrap.py demo [OUT]                   render a small survey and reconstruct it
     python3 bootstrap.py run PHOTOS OUT [options...]  reconstruct a folder of photographs
-    python3 bootstrap.py test [pytest arguments...]   lint, types and tests
+    python3 bootstrap.py test [pytest arguments...]   lint, types and tests, those of QGIS too where it is installed
     python3 bootstrap.py package                      write the zip of the QGIS plugin
 
 Standard library only, Linux, macOS and Windows, no administrator rights. Other programs may import this
@@ -32,6 +32,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent
 STAMP_NAME = "onthefly3r-stamp.json"
 OLDEST_PYTHON = (3, 10)
+QGIS_PYTHON = "ONTHEFLY3R_QGIS_PYTHON"  # variable that names an interpreter with QGIS, for the tests
+QGIS_PACKAGES = ("qgis", "python3-qgis", "qgis-providers", "python3-pytest", "xvfb")
 TEST_EXTRAS = ("cloud", "neural", "test")
 
 # Room that an installation needs while it is under way, in MiB: wheels, their unpacked files and pip's copies.
@@ -235,16 +237,16 @@ def explain_pip_failure(told: str) -> str:
     elif "No matching distribution" in told:
         meaning = (
             "A package has no build for this interpreter and system: "
-            "use a 64-bit Python 3.10 to 3.14; pip's words follow."
+            "use a 64-bit Python 3.10 to 3.14; pip's words are above."
         )
     else:
-        meaning = "pip could not install the package; its words follow."
-    return f"{meaning}\n{told.strip()}"
+        meaning = "pip could not install the package; its words are above."
+    return f"{told.strip()}\n{meaning}"  # last, where people look
 
 
-def _call(command: Sequence[str | Path]) -> int:
+def _call(command: Sequence[str | Path], **variables: str) -> int:
     """Run a command to its end and return its exit status; Ctrl-C is left to the command to handle."""
-    with subprocess.Popen([str(part) for part in command], env=clean_environ()) as process:
+    with subprocess.Popen([str(part) for part in command], env={**clean_environ(), **variables}) as process:
         while True:
             with contextlib.suppress(KeyboardInterrupt):
                 return process.wait()
@@ -266,6 +268,32 @@ def missing_system_libraries(python: Path) -> list[str]:
     except (ValueError, KeyError, TypeError):
         return []
     return [f"{check['name']}: {check['remedy']}" for check in checks if check.get("missing_libraries")]
+
+
+def find_qgis() -> tuple[str, str]:
+    """Return an interpreter that has QGIS and pytest, or an empty text and why the tests of QGIS are left out."""
+    missing = ""
+    for candidate in dict.fromkeys(
+        (os.environ.get(QGIS_PYTHON, ""), "/usr/bin/python3", shutil.which("python3") or "")
+    ):
+        if not candidate or not Path(candidate).is_file():
+            continue
+        lacking = [module for module in ("qgis.core", "pytest") if not _can_import(candidate, module)]
+        if not lacking:
+            return candidate, ""
+        missing = missing or f"{candidate} lacks {' and '.join(lacking)}"
+    return "", (
+        f"{missing or 'no interpreter was found'}; on Debian and Ubuntu: sudo apt-get install --no-install-recommends "
+        f"{' '.join(QGIS_PACKAGES)} (or name an interpreter in {QGIS_PYTHON})"
+    )
+
+
+def _can_import(python: str, module: str) -> bool:
+    command = [python, "-c", f"import {module}"]
+    environ = {**clean_environ(), "QT_QPA_PLATFORM": "offscreen"}
+    return (
+        subprocess.run(command, capture_output=True, check=False, env=environ, stdin=subprocess.DEVNULL).returncode == 0
+    )
 
 
 def setup(environment: Path, rest: Sequence[str] = ()) -> int:
@@ -305,8 +333,18 @@ def test(environment: Path, rest: Sequence[str]) -> int:
     for name, command in checks.items():
         say(f"== {name}")
         outcome[name] = _call(command)
+    left_out = "pytest was given arguments" if rest else ""
+    if not left_out:
+        qgis_python, left_out = find_qgis()
+    if not left_out:
+        say("== tests of QGIS")
+        tests = ROOT / "tests" / "qgis"
+        command = [qgis_python, "-m", "pytest", "-c", tests / "pytest.ini", "--rootdir", tests, tests]
+        outcome["tests of QGIS"] = _call(command, ONTHEFLY3R_PYTHON=str(python), QT_QPA_PLATFORM="offscreen")
     failed = [name for name, status in outcome.items() if status != 0]
-    say(f"Failed: {', '.join(failed)}" if failed else "All checks passed: " + ", ".join(checks))
+    if left_out:
+        say(f"Left out: tests of QGIS ({left_out})")
+    say(f"Failed: {', '.join(failed)}" if failed else "All checks passed: " + ", ".join(outcome))
     return 1 if failed else 0
 
 

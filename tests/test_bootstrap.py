@@ -175,7 +175,7 @@ def test_missing_venv_module_names_the_package(
         ("WARNING: Retrying ... NewConnectionError('...: Temporary failure in name resolution')", "cannot be reached"),
         ("ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device", "disk is full"),
         ("ERROR: No matching distribution found for gtsam>=4.2.1", "no build for this interpreter"),
-        ("error: subprocess-exited-with-error", "its words follow"),
+        ("error: subprocess-exited-with-error", "its words are above"),
     ],
 )
 def test_failure_of_pip_is_explained(bootstrap: ModuleType, told: str, meaning: str) -> None:
@@ -219,7 +219,7 @@ def test_variables_that_lead_astray_do_not_reach_the_environment(
 def calls(bootstrap: ModuleType, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     made: list[list[str]] = []
 
-    def call(command: Sequence[Any]) -> int:
+    def call(command: Sequence[Any], **variables: str) -> int:
         made.append([str(part) for part in command])
         return 5 if "mypy" in made[-1] else 0
 
@@ -251,9 +251,42 @@ def test_every_check_runs_and_one_failure_fails(
     bootstrap: ModuleType, calls: list[list[str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert bootstrap.main(["test", "-k", "options"]) == 1
-    assert [command[2] for command in calls] == ["ruff", "ruff", "mypy", "pytest"]
+    assert [command[2] for command in calls] == ["ruff", "ruff", "mypy", "pytest"]  # QGIS is left out with arguments
     assert calls[-1][-2:] == ["-k", "options"]
     assert capsys.readouterr().out.strip().endswith("Failed: mypy")
+
+
+def test_qgis_is_tested_where_it_is_found(
+    bootstrap: ModuleType, calls: list[list[str]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(bootstrap, "_can_import", lambda python, module: True)
+    monkeypatch.setenv("ONTHEFLY3R_QGIS_PYTHON", sys.executable)
+    bootstrap.main(["test"])
+    assert calls[-1][:3] == [sys.executable, "-m", "pytest"]
+    assert calls[-1][-1] == str(ROOT / "tests" / "qgis")
+    assert "Left out" not in capsys.readouterr().out
+
+
+def test_qgis_that_is_missing_is_told(
+    bootstrap: ModuleType, calls: list[list[str]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(bootstrap, "_can_import", lambda python, module: module == "pytest")
+    monkeypatch.setenv("ONTHEFLY3R_QGIS_PYTHON", sys.executable)
+    bootstrap.main(["test"])
+    assert len(calls) == 4
+    told = capsys.readouterr().out
+    assert f"Left out: tests of QGIS ({sys.executable} lacks qgis.core; on Debian" in told
+    assert "apt-get install --no-install-recommends qgis python3-qgis" in told
+
+
+def test_import_is_tried_in_the_interpreter_itself(bootstrap: ModuleType) -> None:
+    assert bootstrap._can_import(sys.executable, "json")
+    assert not bootstrap._can_import(sys.executable, "no_such_module")
+
+
+def test_packages_for_qgis_are_those_that_ci_installs(bootstrap: ModuleType) -> None:
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    assert f"qgis=({' '.join(bootstrap.QGIS_PACKAGES)})" in script
 
 
 def test_trouble_with_the_environment_is_one_message(

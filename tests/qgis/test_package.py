@@ -1,0 +1,110 @@
+"""The zip against the rules of the QGIS plugin repository."""
+
+from __future__ import annotations
+
+import ast
+import configparser
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path, PurePosixPath
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+NAME = "onthefly3r_qgis"
+REQUIRED = ("name", "qgisMinimumVersion", "description", "about", "version", "author", "email", "repository", "tracker")
+FORBIDDEN = {".pyc", ".so", ".pyd", ".dll", ".dylib", ".exe", ".sh", ".bat", ".cmd", ".ps1", ".zip", ".jar", ".whl"}
+
+
+@pytest.fixture(scope="module")
+def archive(plugin_zip: Path) -> zipfile.ZipFile:
+    return zipfile.ZipFile(plugin_zip)
+
+
+@pytest.fixture(scope="module")
+def metadata(archive: zipfile.ZipFile) -> configparser.SectionProxy:
+    parser = configparser.ConfigParser(interpolation=None)
+    parser.optionxform = str  # type: ignore[assignment,method-assign]
+    parser.read_string(archive.read(f"{NAME}/metadata.txt").decode("utf-8"))
+    return parser["general"]
+
+
+def test_size_and_folder(plugin_zip: Path, archive: zipfile.ZipFile) -> None:
+    assert plugin_zip.stat().st_size <= 25_000_000
+    assert {PurePosixPath(name).parts[0] for name in archive.namelist()} == {NAME}
+    assert archive.testzip() is None
+
+
+def test_no_binaries_scripts_caches_or_hidden_files(archive: zipfile.ZipFile) -> None:
+    for entry in archive.infolist():
+        path = PurePosixPath(entry.filename)
+        assert path.suffix not in FORBIDDEN
+        assert not any(part.startswith((".", "__pycache__", "__MACOSX")) for part in path.parts)
+        assert not archive.read(entry).startswith((b"#!", b"\x7fELF", b"MZ")), path
+        assert entry.external_attr >> 16 == 0o100644
+
+
+def test_what_must_be_inside(archive: zipfile.ZipFile) -> None:
+    names = set(archive.namelist())
+    for name in ("LICENSE", "metadata.txt", "__init__.py", "bootstrap.py", "pyproject.toml", "docs/qgis.md"):
+        assert f"{NAME}/{name}" in names
+    assert archive.read(f"{NAME}/LICENSE") == (ROOT / "LICENSE").read_bytes()
+    modules = {path.relative_to(ROOT).as_posix() for path in (ROOT / "core" / "onthefly3r").rglob("*.py")}
+    assert {f"{NAME}/{name}" for name in modules} <= names
+
+
+def test_metadata(metadata: configparser.SectionProxy, archive: zipfile.ZipFile) -> None:
+    assert all(metadata.get(key, "").strip() for key in REQUIRED)
+    assert (metadata["qgisMinimumVersion"], metadata["qgisMaximumVersion"]) == ("3.22", "4.99")
+    assert re.fullmatch(r"\d+\.\d+\.\d+", metadata["version"])
+    assert metadata["hasProcessingProvider"] == "yes"
+    assert f"{NAME}/{metadata['icon']}" in archive.namelist()
+    assert len(metadata["description"]) < 200 and not metadata["description"].startswith("http")
+    assert "plugin" not in metadata["name"].lower()
+    assert metadata["license"] == "GPL-2.0-or-later"
+    assert "External dependencies" in metadata["about"]
+    requirements = re.search(r"dependencies = \[(.*?)\]\n", (ROOT / "pyproject.toml").read_text(), re.DOTALL)
+    assert requirements
+    for name in re.findall(r'"([\w-]+)', requirements.group(1)):
+        assert name in metadata["about"], name
+
+
+def test_sources_keep_to_the_rules(archive: zipfile.ZipFile) -> None:
+    sources = [name for name in archive.namelist() if name.endswith(".py")]
+    assert len(sources) > 100
+    for name in sources:
+        tree = ast.parse(archive.read(name))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call):
+                called = ast.unparse(node.func)
+                assert called not in ("exec", "eval", "os.system", "os.popen", "pickle.load", "pickle.loads"), name
+                assert not any(word.arg == "shell" for word in node.keywords), name
+            imported = {alias.name for alias in node.names} if isinstance(node, ast.Import) else set()
+            imported |= {node.module or ""} if isinstance(node, ast.ImportFrom) else set()
+            assert not {part.split(".")[0] for part in imported} & {"PyQt5", "PyQt6", "PySide6", "pickle"}, name
+
+
+def test_enums_are_fully_qualified(archive: zipfile.ZipFile) -> None:
+    """Qt 6 knows no other way: Class.Enum.Member."""
+    short = re.compile(
+        r"\b(?:QgsProcessing\.Type|QgsProcessingParameter\w+\.(?:Folder|File|Integer|Double|Flag[A-Z])"
+        r"|QgsWkbTypes\.(?:Point|Polygon|NoGeometry)|QgsFeatureSink\.FastInsert|QgsProcessingAlgorithm\.Flag[A-Z]"
+        r"|Qt\.[A-Z]\w+\b(?!\.))"
+    )
+    for name in archive.namelist():
+        if re.match(rf"{NAME}/(plugin|processing_algorithms)/.*\.py", name):
+            assert not short.search(archive.read(name).decode("utf-8")), name
+
+
+def test_same_source_same_zip(plugin_zip: Path, tmp_path: Path) -> None:
+    from package_plugin import package
+
+    assert package(tmp_path / "again.zip").read_bytes() == plugin_zip.read_bytes()
+
+
+def test_verb_of_bootstrap(plugin_zip: Path) -> None:
+    ran = subprocess.run([sys.executable, str(ROOT / "bootstrap.py"), "package"], capture_output=True, text=True)
+    assert ran.returncode == 0
+    assert Path(ran.stdout.strip()).read_bytes() == plugin_zip.read_bytes()

@@ -1,0 +1,161 @@
+"""Layers as QGIS loads them: styled, grouped, in order; and the menu."""
+
+from __future__ import annotations
+
+import gc
+from pathlib import Path
+from typing import Any
+
+import pytest
+from maps import render, seen_at
+
+
+@pytest.fixture
+def loaded(qgis: Any, run: dict[str, Any], project: Any) -> Any:
+    """The project after layers were loaded as from the toolbox."""
+    from qgis.core import QgsProcessingOutputLayerDefinition
+
+    sinks = {
+        name: QgsProcessingOutputLayerDefinition("TEMPORARY_OUTPUT", project)
+        for name in ("CAMERAS", "REJECTED", "FOOTPRINTS")
+    }
+    qgis.runAndLoadResults("onthefly3r:exportcameras", {"RUN": run["OUTPUT"], **sinks})
+    gc.collect()
+    return project
+
+
+def test_layers_are_grouped_under_the_name_of_the_run(loaded: Any, run: dict[str, Any]) -> None:
+    root = loaded.layerTreeRoot()
+    group = root.findGroup(Path(run["OUTPUT"]).name)
+    names = [node.name() for node in group.children()]
+    assert sorted(names) == ["Cameras", "Footprints", "Rejected photographs"]
+    assert names[-1] == "Footprints"  # below the points
+    assert [child for child in root.children() if child is not group] == [] or len(root.children()) == 1
+    assert len(loaded.mapLayers()) == 3
+
+
+def test_layers_are_styled(loaded: Any) -> None:
+    renderers = {layer.name(): layer.renderer() for layer in loaded.mapLayers().values()}
+    assert renderers["Cameras"].type() == "RuleRenderer"
+    assert renderers["Footprints"].type() in ("graduatedSymbol", "categorizedSymbol")
+    assert "overlap" in renderers["Footprints"].legendClassificationAttribute()
+    assert all(layer.mapTipTemplate() for layer in loaded.mapLayers().values())
+
+
+def test_map_of_the_project_shows_both(loaded: Any) -> None:
+    layers = [node.layer() for node in loaded.layerTreeRoot().findLayers()]
+    by_name = {layer.name(): layer for layer in layers}
+    extent = by_name["Footprints"].extent()
+    picture = render(layers, extent)
+    for feature in by_name["Cameras"].getFeatures():
+        assert seen_at(picture, extent, feature.geometry().asPoint(), 3)
+    below = render([by_name["Footprints"]], extent)
+    assert any(picture.pixel(x, y) != below.pixel(x, y) for x in range(600) for y in range(600))
+
+
+@pytest.mark.parametrize("style", ["cameras", "footprints", "rejected", "checked"])
+def test_styles_use_fields_that_the_layers_have(plugin: Any, style: str) -> None:
+    import re
+
+    layers = plugin("processing_algorithms.layers")
+    fields = {
+        "cameras": layers.CAMERA_FIELDS,
+        "rejected": layers.REJECTED_FIELDS,
+        "footprints": layers.FOOTPRINT_FIELDS,
+        "checked": plugin("processing_algorithms.check_photographs").CHECKED_FIELDS,
+    }[style]
+    names = {name for name, _ in fields}
+    text = (plugin("processing_algorithms.presentation").STYLES / f"{style}.qml").read_text(encoding="utf-8")
+    used = set(re.findall(r"&quot;(\w+)&quot;", text)) | set(re.findall(r'attr="(\w+)"', text))
+    used |= set(re.findall(r'"(\w+)" %\]', text))
+    assert used and used <= names
+
+
+def test_cloud_is_loaded_where_qgis_can_read_it(
+    qgis: Any, plugin: Any, feedback: Any, monkeypatch: pytest.MonkeyPatch, project: Any
+) -> None:
+    from qgis.core import QgsProcessingContext, QgsProviderRegistry
+
+    presentation = plugin("processing_algorithms.presentation")
+    context = QgsProcessingContext()
+    context.setProject(project)
+
+    class Registry:
+        def __init__(self, *providers: str) -> None:
+            self._providers = providers
+
+        def providerList(self) -> list[str]:
+            return list(self._providers)
+
+    monkeypatch.setattr(presentation, "QgsProviderRegistry", type("R", (), {"instance": lambda: Registry("ogr")}))
+    presentation.load_cloud(context, feedback, "/a/cloud.laz", "run")
+    assert not context.layersToLoadOnCompletion()
+    assert "no reader for LAS files" in feedback.told[-1] and "/a/cloud.laz" in feedback.told[-1]
+    monkeypatch.setattr(presentation, "QgsProviderRegistry", type("R", (), {"instance": lambda: Registry("pdal")}))
+    presentation.load_cloud(context, feedback, "/a/cloud.laz", "run")
+    details = context.layersToLoadOnCompletion()["/a/cloud.laz"]
+    assert details.name == "Point cloud" and details.postProcessor() is not None
+    assert QgsProviderRegistry.instance() is not None
+
+
+def test_stale_index_is_removed(plugin: Any, tmp_path: Path) -> None:
+    (tmp_path / "cloud.copc.laz").write_text("")
+    (tmp_path / "ept_cloud").mkdir()
+    (tmp_path / "ept_cloud" / "ept.json").write_text("")
+    (tmp_path / "cloud.laz").write_text("")
+    plugin("processing_algorithms.presentation").remove_stale_index(tmp_path / "cloud.laz")
+    assert [path.name for path in tmp_path.iterdir()] == ["cloud.laz"]
+
+
+def test_menu_opens_and_goes_away(qgis: Any, plugin: Any, run: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    from qgis.core import QgsApplication
+    from qgis.PyQt.QtGui import QGuiApplication
+    from qgis.PyQt.QtWidgets import QMainWindow
+
+    main = plugin("plugin.main")
+    opened: list[str] = []
+    monkeypatch.setattr(main.QDesktopServices, "openUrl", lambda url: opened.append(url.toLocalFile()))
+    monkeypatch.setattr(qgis, "execAlgorithmDialog", lambda name, parameters: opened.append(name))
+
+    class Interface:
+        def __init__(self) -> None:
+            self.window, self.menu, self.toolbar, self.said = QMainWindow(), [], [], []
+
+        def mainWindow(self) -> Any:
+            return self.window
+
+        def messageBar(self) -> Any:
+            return self
+
+        def pushMessage(self, title: str, text: str) -> None:
+            self.said.append(text)
+
+        def addPluginToMenu(self, menu: str, action: Any) -> None:
+            self.menu.append(action)
+
+        def addToolBarIcon(self, action: Any) -> None:
+            self.toolbar.append(action)
+
+        def removePluginMenu(self, menu: str, action: Any) -> None:
+            self.menu.remove(action)
+
+        def removeToolBarIcon(self, action: Any) -> None:
+            if action in self.toolbar:
+                self.toolbar.remove(action)
+
+    monkeypatch.setattr(main.OnTheFly3RPlugin, "initProcessing", lambda self: None)
+    interface = Interface()
+    shown = main.OnTheFly3RPlugin(interface)
+    shown.initGui()
+    assert len(interface.menu) == 4 and len(interface.toolbar) == 1
+    assert not any(action.icon().isNull() for action in interface.menu)
+    for action in interface.menu:
+        action.trigger()
+    assert opened == ["onthefly3r:reconstruct", run["REPORT"], "onthefly3r:setup"]
+    assert interface.said == ["Copied."] or interface.said == ["No failure has been noted."]
+    plugin("plugin.settings").save_diagnostics("what happened")
+    interface.menu[3].trigger()
+    assert QGuiApplication.clipboard().text() == "what happened"
+    shown.unload()
+    assert not interface.menu and not interface.toolbar
+    assert QgsApplication.processingRegistry().providerById("onthefly3r") is not None
