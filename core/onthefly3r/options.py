@@ -140,7 +140,19 @@ class RegistrationOptions:
     max_scale_ratio: float = option(
         2.0, "largest factor by which a subset's scale may differ from the expected one", minimum=1.01, advanced=True
     )
+    validation: bool = option(
+        True, "check every subset before it may touch the map, drop bad references, retry (V&R)", advanced=True
+    )
+    reference_gate: float = option(
+        6.0,
+        "a reference is also bad when it is shifted by so many medians of the references' shifts; 0 switches it off",
+        minimum=0.0,
+        advanced=True,
+    )
     validate_queries: bool = option(True, "check new images against the map, not only references", advanced=True)
+    gps_check: bool = option(
+        True, "ask for a second reconstruction of an image that lands far from its GPS position", advanced=True
+    )
     max_retries: int = option(3, "how often a rejected image is tried again", unit="times", minimum=0, advanced=True)
 
 
@@ -153,6 +165,9 @@ class PoseGraphOptions:
         "sim3 moves submaps with their points, se3 is the paper's frame graph, none switches it off",
         choices=("sim3", "se3", "none"),
         advanced=True,
+    )
+    gps_priors: bool = option(
+        True, "let GPS positions keep a large map from bending, as far as they are accurate (sim3 only)", advanced=True
     )
 
 
@@ -240,7 +255,9 @@ PAPER_VALUES: dict[str, Any] = {
     "lookahead": 1,
     "subset_references": 5,
     "gps_candidates": False,
+    "reference_gate": 0.0,
     "validate_queries": False,
+    "gps_check": False,
     "max_retries": 0,
     "reference_points": 5000,
     "pose_graph": "se3",

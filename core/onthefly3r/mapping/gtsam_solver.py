@@ -10,27 +10,34 @@ import numpy as np
 from ..geometry.arrays import Float
 from ..geometry.transforms import Rigid3, Sim3
 from ..records import Edge, FrameEdge
-from .posegraph import HUBER, MAX_ITERATIONS
+from .posegraph import HUBER, MAX_ITERATIONS, PosePrior, floored
 
 
 class GtsamSolver:
     """Levenberg-Marquardt with a Huber kernel on every edge."""
 
-    def solve_sim3(self, nodes: Mapping[int, Sim3], edges: Sequence[Edge], fixed: int) -> dict[int, Sim3]:
-        """Return optimised map_from_submap of all nodes."""
+    def solve_sim3(
+        self, nodes: Mapping[int, Sim3], edges: Sequence[Edge], priors: Sequence[PosePrior], fixed: int
+    ) -> dict[int, Sim3]:
+        """Return optimised map_from_submap of all nodes; without priors the node `fixed` keeps its pose."""
         import gtsam
 
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for key, pose in nodes.items():
             values.insert(key, to_similarity3(pose))
-        graph.add(gtsam.NonlinearEqualitySimilarity3(fixed, to_similarity3(nodes[fixed])))
+        if not priors:
+            graph.add(gtsam.NonlinearEqualitySimilarity3(fixed, to_similarity3(nodes[fixed])))
+        for prior in priors:
+            # No kernel: where a whole map has bent, every prior is far off and right.
+            noise = gtsam.noiseModel.Gaussian.Information(floored(prior.information))
+            graph.add(gtsam.PriorFactorSimilarity3(prior.submap, to_similarity3(prior.map_from_submap), noise))
         for edge in edges:
             graph.add(
                 gtsam.BetweenFactorSimilarity3(
                     edge.source,
                     edge.target,
                     to_similarity3(edge.source_from_target),
-                    _robust(_floored(edge.covariance)),
+                    _robust(floored(edge.covariance)),
                 )
             )
         solved = _optimise(graph, values)
@@ -81,12 +88,6 @@ def _robust(covariance: Float) -> Any:
 
     gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER), gaussian)
-
-
-def _floored(covariance: Float) -> Float:
-    """Keep a covariance invertible where the points of an edge leave a direction all but perfectly known."""
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    return np.asarray((vectors * np.maximum(values, 1e-10 * values.max())) @ vectors.T)
 
 
 def _optimise(graph: Any, values: Any) -> Any:

@@ -6,26 +6,43 @@ The solver sits behind `PoseGraphSolver`, because gtsam has no wheels for Window
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
+import numpy as np
+
 from ..errors import MissingDependencyError
-from ..geometry.transforms import Rigid3, Sim3
+from ..geometry.arrays import Float
+from ..geometry.transforms import Rigid3, Sim3, rotation_log
 from ..records import Edge, FrameEdge
 from .state import MapState
 
 HUBER = 1.345  # whitened units
 MAX_ITERATIONS = 30
+MEDIAN_MISFIT = 6.35  # of a chi-squared variable of seven degrees of freedom
+OUTLYING_PRIOR = 50.0  # times the usual squared misfit
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """What is known of a submap's pose from outside the map."""
+
+    submap: int
+    map_from_submap: Sim3
+    information: Float  # (7, 7) of [rotation rad, translation, log scale], right perturbation; may be singular
 
 
 class PoseGraphSolver(Protocol):
-    """Robust least squares over poses; the node `fixed` keeps its pose."""
+    """Robust least squares over poses."""
 
-    def solve_sim3(self, nodes: Mapping[int, Sim3], edges: Sequence[Edge], fixed: int) -> dict[int, Sim3]:
-        """Return optimised map_from_submap of all nodes."""
+    def solve_sim3(
+        self, nodes: Mapping[int, Sim3], edges: Sequence[Edge], priors: Sequence[PosePrior], fixed: int
+    ) -> dict[int, Sim3]:
+        """Return optimised map_from_submap of all nodes; without priors the node `fixed` keeps its pose."""
         ...
 
     def solve_se3(self, nodes: Mapping[int, Rigid3], edges: Sequence[FrameEdge], fixed: int) -> dict[int, Rigid3]:
-        """Return optimised map_from_cam of all nodes."""
+        """Return optimised map_from_cam of all nodes; the node `fixed` keeps its pose."""
         ...
 
 
@@ -43,14 +60,52 @@ def default_solver() -> PoseGraphSolver:
     return GtsamSolver()
 
 
-def optimise_submaps(state: MapState, solver: PoseGraphSolver) -> float:
-    """Move the submaps to agree with all edges (Eq. 16 on Sim(3)); return the largest shift in scene spacings."""
-    if not has_loops(len(state.map_from_submap), state.edges):
+def optimise_submaps(state: MapState, solver: PoseGraphSolver, priors: Sequence[PosePrior] = ()) -> float:
+    """Move the submaps to agree with all edges and priors (Eq. 16 on Sim(3)); return the largest shift in spacings.
+
+    Once the map has settled, priors that stand out are dropped as wrong, and the edges' covariances grow to the
+    misfits that are left: local models that all bend alike contradict each other more than their points show. Then
+    it settles once more.
+    """
+    if not priors and not has_loops(len(state.map_from_submap), state.edges):
         return 0.0
     before = {index: state.map_from_cam(index).translation for index in state.frames}
-    state.move_submaps(solver.solve_sim3(state.map_from_submap, state.edges, fixed=0))
-    shift = max(float(abs(state.map_from_cam(i).translation - before[i]).max()) for i in before)
+    solved = solver.solve_sim3(state.map_from_submap, state.edges, priors, fixed=0)
+    if priors:
+        good = agreeing_priors(solved, priors)
+        solved = solver.solve_sim3(solved, honest_edges(solved, state.edges), good, fixed=0)
+    state.move_submaps(solved)
+    shift = max(float(np.abs(state.map_from_cam(i).translation - before[i]).max()) for i in before)
     return shift / state.spacing
+
+
+def agreeing_priors(nodes: Mapping[int, Sim3], priors: Sequence[PosePrior]) -> list[PosePrior]:
+    """Return the priors whose misfit is not far beyond the usual one (and beyond their own uncertainty)."""
+    steps = [tangent(p.map_from_submap.inverse() @ nodes[p.submap]) for p in priors]
+    misfit = [float(step @ p.information @ step) for step, p in zip(steps, priors, strict=True)]
+    limit = OUTLYING_PRIOR * max(float(np.median(misfit)), MEDIAN_MISFIT)
+    return [prior for prior, value in zip(priors, misfit, strict=True) if value <= limit]
+
+
+def honest_edges(nodes: Mapping[int, Sim3], edges: Sequence[Edge]) -> list[Edge]:
+    """Return the edges with covariances that are as large, in the median, as the misfits at the given poses."""
+    if not edges:
+        return []
+    steps = [tangent(e.source_from_target.inverse() @ (nodes[e.source].inverse() @ nodes[e.target])) for e in edges]
+    misfit = [float(step @ np.linalg.solve(floored(e.covariance), step)) for step, e in zip(steps, edges, strict=True)]
+    factor = max(1.0, float(np.median(misfit)) / MEDIAN_MISFIT)
+    return [replace(edge, covariance=factor * edge.covariance) for edge in edges]
+
+
+def tangent(transform: Sim3) -> Float:
+    """Return [rotation rad, translation, log scale] (7,) of a transform near the identity."""
+    return np.array([*rotation_log(transform.rotation), *transform.translation, np.log(transform.scale)])
+
+
+def floored(symmetric: Float) -> Float:
+    """Keep a covariance or information invertible where it leaves a direction all but perfectly known or open."""
+    values, vectors = np.linalg.eigh(0.5 * (symmetric + symmetric.T))
+    return np.asarray((vectors * np.maximum(values, 1e-10 * values.max())) @ vectors.T)
 
 
 def optimise_frames(state: MapState, solver: PoseGraphSolver) -> None:

@@ -82,7 +82,7 @@ def register(
         return Rejection(subset.new, first.stage, first.reason, first.numbers)
     return Registration(
         alignment=alignment,
-        edges=_submap_edges(only(pairs, kept), state),
+        edges=_submap_edges(only(pairs, kept), state, alignment.residual),
         residuals=verdict.residuals,
         accepted=tuple(accepted),
         refused=tuple(refused),
@@ -109,14 +109,17 @@ def _sample(view: LocalView, min_confidence: float, seed: int, count: int = 200)
     return np.asarray(points[np.random.default_rng(seed).permutation(len(points))[:count]], float)
 
 
-def _submap_edges(pairs: Correspondences, state: MapState) -> tuple[Edge, ...]:
-    """One Sim(3) edge to each submap that predicted some of the references; the target is the next submap."""
+def _submap_edges(pairs: Correspondences, state: MapState, residual: float) -> tuple[Edge, ...]:
+    """One Sim(3) edge to each submap that predicted some of the references; the target is the next submap.
+
+    A single reference fits itself however wrong it is: what all references together miss is its error too.
+    """
     target = state.next_submap()
     owner = np.array([state.frames[int(i)].submap for i in pairs.reference], int)
     edges = []
     for source in np.unique(owner):
         members = tuple(int(i) for i in np.unique(pairs.reference[owner == source]))
-        found = align(only(pairs, members))
+        found = align(only(pairs, members), least_residual=residual)
         if isinstance(found, Rejection):
             continue
         source_from_map = state.map_from_submap[int(source)].inverse()

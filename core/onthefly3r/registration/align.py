@@ -14,15 +14,17 @@ MAX_ITERATIONS = 20
 SETTLED = 1e-3  # iterations end when no point moves by more than so many robust standard deviations
 HUBER = 1.345  # in robust standard deviations: 95 % efficiency on Gaussian residuals
 INLIER = 3.0  # in robust standard deviations
-# Points of one image err together (its pose, its depth scale): an image counts as so many independent points.
-INDEPENDENT_POINTS_PER_REFERENCE = 12
+# Points of one image err together (its pose, its depth scale): an image counts as so many independent points, as
+# many as fix a rigid body.
+INDEPENDENT_POINTS_PER_REFERENCE = 3
 
 
-def align(pairs: Correspondences, images: tuple[int, ...] = ()) -> Alignment | Rejection:
+def align(pairs: Correspondences, images: tuple[int, ...] = (), least_residual: float = 0.0) -> Alignment | Rejection:
     """Return map_from_local minimising Eq. 11, closed form first, then iteratively reweighted with Huber.
 
     The kernel's width follows the residuals (median absolute deviation), so it needs no unit. `images` are named
-    in the `Rejection` that answers too few or degenerate correspondences.
+    in the `Rejection` that answers too few or degenerate correspondences. `least_residual` (map units) is what the
+    covariance takes the residuals for when they are smaller: few references fit well by accident.
     """
     if len(pairs.weight) < MIN_POINTS:
         return Rejection(images, "alignment", "too few corresponding points", {"points": float(len(pairs.weight))})
@@ -46,7 +48,9 @@ def align(pairs: Correspondences, images: tuple[int, ...] = ()) -> Alignment | R
     references = tuple(int(i) for i in np.unique(pairs.reference))
     return Alignment(
         map_from_local=map_from_local,
-        covariance=_covariance(pairs.local[inlier], spread / map_from_local.scale, len(references)),
+        covariance=_covariance(
+            pairs.local[inlier], max(spread, least_residual) / map_from_local.scale, len(references)
+        ),
         inlier_ratio=float(inlier.mean()),
         residual=spread,
         n_points=len(distance),
