@@ -74,7 +74,7 @@ def settle(pieces: Sequence[Piece], edges: Sequence[Edge], root: int) -> dict[in
                     reached.append(other)
         front = reached
     inside = [edge for edge in edges if edge.source in poses]
-    return default_solver().solve_sim3(poses, inside, fixed=root) if has_loops(len(poses), inside) else poses
+    return default_solver().solve_sim3(poses, inside, (), fixed=root) if has_loops(len(poses), inside) else poses
 
 
 def cameras(pieces: Iterable[Piece], map_from_piece: Mapping[int, Sim3], owner: Mapping[int, int]) -> dict[int, Rigid3]:

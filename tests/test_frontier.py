@@ -1,0 +1,71 @@
+"""Which images may be reconstructed with the map, and which wait for their neighbours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from onthefly3r.records import Subset
+from onthefly3r.selection.frontier import Frontier, orphans
+from onthefly3r.selection.index import RetrievalIndex
+
+ANGLE_DEG = 10.0  # between neighbours on a line: similarity 0.985, 0.940, 0.866, 0.766, 0.643 ...
+
+
+def line(count: int, index: RetrievalIndex | None = None) -> RetrievalIndex:
+    """Images on a great circle: the further apart, the less alike."""
+    index = index or RetrievalIndex()
+    for k in range(count):
+        angle = np.radians(ANGLE_DEG * k)
+        index.add(k, np.array([np.cos(angle), np.sin(angle), 0.0], np.float32))
+    return index
+
+
+def frontier_of(index: RetrievalIndex, count: int, placed: list[int]) -> Frontier:
+    frontier = Frontier()
+    frontier.add(list(range(count)), index)
+    index.accept(placed)
+    frontier.placed(placed, index)
+    return frontier
+
+
+def test_images_next_to_the_map_are_ready_and_far_ones_wait() -> None:
+    index = line(9)
+    frontier = frontier_of(index, 9, [0, 1, 2, 3])
+    assert frontier.ready([4, 5, 6, 7, 8]) == [4, 5]
+    assert frontier.ready([8, 6, 7]) == [6]  # nothing is ready: the nearest
+
+
+def test_readiness_grows_with_the_map() -> None:
+    index = line(12)
+    frontier = frontier_of(index, 12, [0, 1, 2, 3])
+    index.accept([4, 5])
+    frontier.placed([4, 5], index)
+    assert frontier.ready([6, 7, 8]) == [6, 7]
+
+
+@pytest.mark.parametrize("step", [1, 4, 9])
+def test_images_that_arrive_one_by_one_are_judged_like_all_at_once(step: int) -> None:
+    index = line(9)
+    frontier = Frontier()
+    for start in range(0, 9, step):
+        frontier.add(list(range(start, min(start + step, 9))), index)
+    index.accept([0, 1, 2, 3])
+    frontier.placed([0, 1, 2, 3], index)
+    assert frontier.ready([4, 5, 6, 7, 8]) == [4, 5]
+
+
+def test_a_far_image_is_ready_where_nothing_is_nearer() -> None:
+    index = line(4)
+    angle = np.radians(ANGLE_DEG * 7)
+    index.add(4, np.array([np.cos(angle), np.sin(angle), 0.0], np.float32))
+    assert frontier_of(index, 5, [0, 1, 2, 3]).ready([4]) == [4]
+
+
+def test_orphans_are_images_whose_own_references_were_pruned() -> None:
+    index = line(12)
+    subset = Subset((0, 1, 2, 9, 10, 11), (3, 8))
+    assert orphans(subset, (0, 1, 2), index, min_shared=2) == [8]
+    assert orphans(subset, (9, 10, 11), index, min_shared=2) == [3]
+    assert orphans(subset, (0, 1, 2, 9, 10), index, min_shared=2) == []
+    assert orphans(Subset((0,), (3,)), (0,), index, min_shared=2) == []
