@@ -58,7 +58,7 @@ def _read_npz(path: Path, images: Sequence[str]) -> PoseSet:
     if path.stat().st_size > MAX_NPZ_BYTES:
         raise ReferenceFormatError(f"{path}: larger than {MAX_NPZ_BYTES} bytes; write the poses alone")
     try:
-        with np.load(path, allow_pickle=False) as held:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as held:
             key = next((k for k in POSE_KEYS if k in held.files), None)
             if key is None:
                 raise ReferenceFormatError(f"{path}: holds none of {', '.join(POSE_KEYS)}, but {', '.join(held.files)}")
