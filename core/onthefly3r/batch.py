@@ -28,6 +28,7 @@ Status = Literal["done", "failed", "skipped"]
 
 MAX_TABLE_BYTES = 16 * 1024 * 1024
 OWN_COLUMNS = ("name", "photos")
+SOURCE = Path(__file__).resolve().parents[1]  # a flight runs by the same source as the batch
 POLL_S = 0.1
 GRACE_S = 1.0
 MEMORY_REMEDY = "most likely the memory did not suffice: lower working_px or dense_px"
@@ -235,7 +236,6 @@ def _run(job: Job, follow: Callable[[Event], None], cancel: Callable[[], bool] |
     with tempfile.TemporaryDirectory(prefix="onthefly3r-") as scratch:
         file = Path(scratch) / "job.json"
         job.write(file)
-        source = str(Path(__file__).resolve().parents[1])
         process = subprocess.Popen(
             [sys.executable, "-m", __package__, "job", str(file)],
             stdin=subprocess.DEVNULL,
@@ -243,7 +243,7 @@ def _run(job: Job, follow: Callable[[Event], None], cancel: Callable[[], bool] |
             stderr=subprocess.DEVNULL,
             encoding="utf-8",
             errors="replace",
-            env={**os.environ, "PYTHONPATH": source, "PYTHONUTF8": "1"},
+            env={**os.environ, "PYTHONPATH": str(SOURCE), "PYTHONUTF8": "1"},
         )
         reader = threading.Thread(target=read, args=(process.stdout,), daemon=True)
         reader.start()

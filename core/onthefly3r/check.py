@@ -378,7 +378,7 @@ def _estimated_time_s(shots: Sequence[Shot], options: Options) -> float | None:
         rgb = load_working_image(shot, options.backbone.working_px).rgb
         extract_features(rgb, options.backbone.features, extractor)
     features_s = (time.perf_counter() - began) / len(sample) / (options.backbone.threads or os.cpu_count() or 1)
-    dense = (options.backbone.dense_px / options.backbone.working_px) ** 2 if options.export.cloud else 0.0
+    dense = min(1.0, options.backbone.dense_px / options.backbone.working_px) ** 2
     return len(shots) * features_s * (1.0 + SPARSE_FACTOR + DENSE_FACTOR * dense)
 
 

@@ -29,9 +29,9 @@ def extract_features(rgb: UInt8, max_features: int, extractor: Any = None) -> Fe
     extractor = extractor or new_extractor(max_features)
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     keypoints, descriptors = extractor.extract(pycolmap.Bitmap.from_array(gray))
-    table = np.asarray(pycolmap.keypoints_to_matrix(keypoints), np.float32).reshape(len(keypoints), -1)
-    if len(table) == 0:
-        table = np.zeros((0, 4), np.float32)
+    table = np.zeros((0, 4), np.float32)  # what an image without any texture has
+    if len(keypoints) > 0:
+        table = np.asarray(pycolmap.keypoints_to_matrix(keypoints), np.float32)
     return Features(
         pixels=table[:, :2],
         scales=table[:, 2],

@@ -1,0 +1,21 @@
+"""Local features of working images."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from onthefly3r.backbones.features import extract_features
+
+
+def test_image_without_texture_has_no_features() -> None:
+    features = extract_features(np.full((120, 160, 3), 90, np.uint8), max_features=500)
+    assert features.pixels.shape == (0, 2) and features.descriptors.shape == (0, 128)
+
+
+def test_features_lie_in_the_image() -> None:
+    blocks = np.random.default_rng(1).integers(0, 255, (24, 32, 3), np.uint8)
+    rgb = np.kron(blocks, np.ones((10, 10, 1), np.uint8))
+    features = extract_features(rgb, max_features=50)
+    assert len(features.pixels) > 40
+    assert (features.pixels >= 0.0).all() and (features.pixels <= (320.0, 240.0)).all()
+    assert len(features.pixels) == len(features.scales) == len(features.angles) == len(features.descriptors)
