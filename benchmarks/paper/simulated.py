@@ -35,21 +35,21 @@ class Scenario:
     strips: int
     drones: int  # that fly side by side and whose photographs arrive in turn
     look_alike: bool
-    grid_side_px: int  # of the point maps
     noise: Noise
     faults: Faults
 
 
+GRID_SIDE_PX = 64  # longest side of the point maps: coarse, so that thousands of images take minutes
 NOISE = Noise(rotation_deg=0.15, position_m=0.3, depth=0.002, log_scale=0.10, bend_m=0.3)
 FAULTS = Faults(bad_view_rate=0.02, strays=True)
 SCENARIOS = {
     scenario.name: scenario
     for scenario in (
-        Scenario("small", 120, 6, 2, True, 112, NOISE, FAULTS),
-        Scenario("joint", 58, 5, 1, False, 224, NOISE, replace(FAULTS, bad_view_rate=0.0)),
-        Scenario("HAV", 424, 14, 2, False, 224, NOISE, FAULTS),
-        Scenario("Residence", 2582, 33, 2, True, 96, NOISE, FAULTS),
-        Scenario("Campus", 5871, 50, 3, True, 64, NOISE, FAULTS),
+        Scenario("small", 120, 6, 2, True, NOISE, FAULTS),
+        Scenario("joint", 58, 5, 1, False, NOISE, replace(FAULTS, bad_view_rate=0.0)),
+        Scenario("HAV", 424, 14, 2, False, NOISE, FAULTS),
+        Scenario("Residence", 2582, 33, 2, True, NOISE, FAULTS),
+        Scenario("Campus", 5871, 50, 3, True, NOISE, FAULTS),
     )
 }
 
@@ -79,12 +79,12 @@ def run_one(scenario: Scenario, strategy: str, seed: int, out: Path) -> dict[str
     """Run a strategy, write its poses and its row of figures, and return the row."""
     survey = survey_of(scenario, seed)
     shots = [replace(shot, gps=None, attitude=None) for shot in oracle_shots(survey)]  # images alone, as in the paper
-    images = {image.shot.name: image for image in oracle_images(survey, scenario.grid_side_px).values()}
+    images = {image.shot.name: image for image in oracle_images(survey, GRID_SIDE_PX).values()}
 
     def load(shot: Shot) -> WorkingImage:
         return images[shot.name]
 
-    backbone = OracleBackbone(survey, scenario.noise, scenario.faults, seed, grid_side_px=scenario.grid_side_px)
+    backbone = OracleBackbone(survey, scenario.noise, scenario.faults, seed, grid_side_px=GRID_SIDE_PX)
     describer = OracleDescriber(survey, seed=seed)
     with tempfile.TemporaryDirectory() as work:
         placement = place(strategy, Task(shots, load, backbone, describer, Path(work)))
