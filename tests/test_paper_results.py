@@ -202,6 +202,21 @@ def test_a_method_that_knows_nothing_of_the_scene_is_told(data: Path) -> None:
         measure_all(data / "nothing", {})
 
 
+def test_time_and_memory_come_from_our_report_too(data: Path) -> None:
+    folder = data / "results" / "Mine" / "HAV"
+    write_colmap(folder, truth())
+    memory = {
+        "peak_rss_mib": 900.0,
+        "stages": {"retrieval": {"peak_gpu_mib": 500.0}, "backbone": {"peak_gpu_mib": 9000.0}},
+    }
+    (folder / "report.json").write_text(json.dumps({"timing": {"total_s": 24.0}, "memory": memory}), encoding="utf-8")
+    found = measure(data / "results" / "Mine", scenes_of(data)["HAV"])  # type: ignore[arg-type]
+    assert found.seconds == 24.0 and found.peak_gpu_gb == pytest.approx(9.437, abs=1e-3)
+    (folder / "report.json").write_text('{"timing": {}}', encoding="utf-8")
+    with pytest.raises(ReferenceFormatError, match=r"report\.json"):
+        measure(data / "results" / "Mine", scenes_of(data)["HAV"])  # type: ignore[arg-type]
+
+
 def test_the_command_prints_all_outdoor_tables(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     roots = ["--gauu-scene", str(data / "gauu"), "--urban-scene", str(data / "urban")]
     assert main(["compare", str(data / "results"), *roots]) == 0

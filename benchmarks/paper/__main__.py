@@ -112,7 +112,12 @@ def _parser() -> argparse.ArgumentParser:
 
     command = commands.add_parser("simulated", help="all strategies with the oracle on simulated surveys")
     command.set_defaults(command=_simulated)
-    command.add_argument("--scenario", nargs="+", choices=simulated.SCENARIOS, default=["HAV", "Residence", "Campus"])
+    command.add_argument(
+        "--scenario",
+        nargs="+",
+        choices=simulated.SCENARIOS,
+        default=["joint", "HAV-in-order", "HAV", "Residence", "Campus"],
+    )
     command.add_argument("--seed", nargs="+", type=int, default=[0, 1, 2])
     _common(command, Path("evidence-simulated"))
 

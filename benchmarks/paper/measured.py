@@ -23,6 +23,7 @@ from .datasets import Scene
 from .results import read_result
 
 POSE_SUFFIXES = (".npz", ".txt", ".tum", ".csv", "")
+BYTES_PER_MIB = 2**20
 CLOUD_SUFFIXES = (".ply", ".laz", ".las", "")
 OURS = "On-the-Fly3R (Pi3x)"  # whose accepted frames are the common set, as in the paper
 
@@ -106,14 +107,15 @@ def _has_cloud(path: Path) -> bool:
 
 
 def _price(*paths: Path) -> tuple[float | None, float | None]:
-    """Return (seconds, peak GPU memory in GB) from the first of these files that is there."""
+    """Return (seconds, peak GPU memory in GB) from the first of these files that is there; the last may be our report."""
     path = next((path for path in paths if path.is_file()), None)
     if path is None:
         return None, None
     try:
         told = json.loads(path.read_text(encoding="utf-8"))
         if path.name == "report.json":
-            seconds, peak = told["timing"]["total_s"], told.get("memory", {}).get("peak_gpu_gib")
+            used = [stage.get("peak_gpu_mib", 0.0) for stage in told["memory"]["stages"].values()]
+            seconds, peak = told["timing"]["total_s"], max(used, default=0.0) * BYTES_PER_MIB / 1e9 or None
         else:
             seconds, peak = told.get("seconds"), told.get("peak_gpu_gb")
         return (None if seconds is None else float(seconds)), (None if peak is None else float(peak))
