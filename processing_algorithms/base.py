@@ -24,7 +24,8 @@ Stages = Mapping[str, tuple[int, int]]
 RUN_STAGES: Stages = {
     "reading photographs": (0, 25),
     "starting the map": (25, 30),
-    "reconstructing": (30, 85),
+    "reconstructing": (30, 83),
+    "refining the cameras": (83, 85),
     "georeferencing": (85, 86),
     "collecting points": (86, 92),
     "fusing the cloud": (92, 99),

@@ -15,6 +15,7 @@ from .intake.cache import ImageCache
 from .mapping.frames import new_frame
 from .mapping.gpsprior import pose_priors, tie_to_positions
 from .mapping.posegraph import PoseGraphSolver, default_solver, optimise_frames, optimise_submaps
+from .mapping.refine import refine
 from .mapping.register import Registration, check_seed, frame_edges, register
 from .mapping.state import MapState
 from .mapping.store import Store
@@ -71,6 +72,7 @@ class Engine:
         self.backbone_calls = 0
         self.batch_sizes: list[int] = []
         self.pruned_references = 0
+        self.refinement: Mapping[str, float] = {}
         self.warnings: list[str] = []
         self._backbone = backbone
         self._describer = describer
@@ -107,6 +109,7 @@ class Engine:
             "mean_batch": sum(self.batch_sizes) / len(self.batch_sizes) if self.batch_sizes else 0.0,
             "pruned_references": float(self.pruned_references),
             "retried_images": float(sum(count > 0 for count in self.retries.values())),
+            **self.refinement,
         }
 
     # ------------------------------------------------------------------ images in
@@ -135,6 +138,8 @@ class Engine:
         self._describe_pending(force=True)
         self._advance(finishing=True)
         self._optimise()
+        if self.options.pose_graph.refine and self.state.frames:
+            self._refine()
 
     def _prepare(self, index: int) -> tuple[int, PhotographError | None]:
         try:
@@ -312,7 +317,7 @@ class Engine:
             points = self.options.registration.reference_points
             frames = [new_frame(i, submap.number, model.views[i], self._images[i], threshold, points) for i in accepted]
             complete = replace(submap, frames=tuple(new.frame for new in frames))
-            self.state.commit(complete, frames, model.calibrations)
+            self.state.commit(complete, frames, model.calibrations, model.observations)
         placed = [new.frame.index for new in frames]
         for index in placed:
             self.rejections.pop(index, None)
@@ -349,6 +354,14 @@ class Engine:
                 optimise_submaps(self.state, self._solver, priors)
             else:
                 optimise_frames(self.state, self._solver)
+
+    def _refine(self) -> None:
+        with self.stopwatch.stage("refinement"):
+            self._checkpoint("refining the cameras", 0, 1)
+            refined = refine(self.state, self.store.stream_observations(), self.shots)
+            if refined is not None:
+                self.state.move_refined(refined.map_from_submap, refined.calibrations)
+                self.refinement = refined.notes
 
     def _checkpoint(self, stage: str, done: int, total: int) -> None:
         if self._cancel is not None and self._cancel():

@@ -169,6 +169,11 @@ class PoseGraphOptions:
     gps_priors: bool = option(
         True, "let GPS positions keep a large map from bending, as far as they are accurate (sim3 only)", advanced=True
     )
+    refine: bool = option(
+        True,
+        "adjust all cameras and their intrinsics together at the end, where the local reconstructor matches features",
+        advanced=True,
+    )
 
 
 @dataclass(frozen=True)
@@ -261,6 +266,7 @@ PAPER_VALUES: dict[str, Any] = {
     "max_retries": 0,
     "reference_points": 5000,
     "pose_graph": "se3",
+    "refine": False,
 }
 
 

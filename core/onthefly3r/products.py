@@ -147,7 +147,8 @@ def placed_cameras(
             PlacedCamera(
                 index=index,
                 name=shot.name,
-                camera=stored.camera.through(stored.grid_from_photo.inverse(), shot.width_px, shot.height_px),
+                camera=state.calibrations.get(shot.camera_key)
+                or stored.camera.through(stored.grid_from_photo.inverse(), shot.width_px, shot.height_px),
                 world_from_cam=frame.pose(state.map_from_cam(index)),
                 batch=stored.submap,
                 retries=retries.get(index, 0),
@@ -223,7 +224,7 @@ def _cloud(
         if count == 0:
             continue
         yield CloudTile(
-            points=frame.points(state.map_from_submap[stored.submap].apply(stored.points.astype(float))),
+            points=frame.points(state.submap_pose_of(stored.index).apply(stored.points.astype(float))),
             rgb=stored.rgb,
             confidence=stored.confidence.astype(np.float32) / np.float32(255.0),
             source=np.full(count, stored.index, np.int32),

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from .geometry.arrays import Float, UInt8
+from .geometry.arrays import Float, Int, UInt8
 from .geometry.camera import Camera, PixelMap
 from .geometry.transforms import Rigid3, Sim3
 
@@ -132,12 +132,24 @@ class LocalView:
 
 
 @dataclass(frozen=True)
+class Observations:
+    """Which features of which images a local model saw as one point."""
+
+    image: Int  # (M,) shot index
+    feature: Int  # (M,) index among the local features of the image, the same in every subset
+    pixel: Float  # (M, 2) float32, upright photograph
+    point: Int  # (M,) row of points
+    points: Float  # (N, 3) float32, local frame
+
+
+@dataclass(frozen=True)
 class LocalModel:
     """Phi(f(subset)) (Eq. 1, Eq. 9): views by shot index in one arbitrary local frame; failed images are missing."""
 
     views: Mapping[int, LocalView]
     metric: bool = False  # local units are metres
     calibrations: Mapping[str, Camera] = field(default_factory=dict)  # per camera key, photograph size
+    observations: Observations | None = None  # of a backbone that matches features
     notes: Mapping[str, float] = field(default_factory=dict)  # figures for the report
     left_out: tuple[int, ...] = ()  # new images that memory had no room for: not looked at, to be asked for again
 

@@ -1,13 +1,15 @@
 """Bundle adjustment of poses, points and shared intrinsics with priors on the intrinsics, in vectorised numpy.
 
-Levenberg-Marquardt with the points eliminated (Triggs et al. 2000, Bundle Adjustment - A Modern Synthesis). The
-gauge is left free: the damping takes care of it, and the intrinsics do not depend on it.
+Levenberg-Marquardt with the points eliminated (Triggs et al. 2000, Bundle Adjustment - A Modern Synthesis), sparse, so
+that it serves the first model and the whole map alike. The gauge is left free: the damping takes care of it, and the
+intrinsics do not depend on it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +39,7 @@ class State:
 class NormalEquations:
     """The normal equations of poses and intrinsics (C, D of them) and points (P), what they share by observation."""
 
-    cc: Float  # (D, D)
+    cc: Any  # (D, D) sparse
     pp: Float  # (N, 3, 3)
     pose_point: Float  # (M, 6, 3)
     intrinsics_point: Float  # (K, N, 6, 3)
@@ -46,32 +48,47 @@ class NormalEquations:
     image: Int  # (M,)
     point: Int  # (M,)
 
-    def eliminated(self, damping: float) -> tuple[Float, Float, Float]:
-        """Return the root R of pp^-1 = R R^T (N, 3, 3), cp R (D, 3N), and the damped system of C alone (D, D)."""
+    def eliminated(self, damping: float) -> tuple[Float, Any, Any]:
+        """Return the root R of pp^-1 = R R^T (N, 3, 3), cp R (D, 3N), and the damped system of C alone (D, D), sparse."""
+        from scipy import sparse
+
         trace = np.einsum("nii->n", self.pp)
         diagonal = damping * np.einsum("nii->ni", self.pp) + (LEAST_DAMPING * trace + (trace == 0.0))[:, None]
         root = np.swapaxes(np.linalg.inv(np.linalg.cholesky(self.pp + diagonal[:, :, None] * np.eye(3))), 1, 2)
-        cp = np.zeros((len(self.c), len(self.pp), 3))
-        cp[6 * self.image[:, None] + np.arange(6), self.point[:, None]] = self.pose_point @ root[self.point]
-        shared = np.swapaxes(self.intrinsics_point @ root, 1, 2)
-        cp[len(self.c) - shared.shape[0] * len(PARAMETERS) :] = shared.reshape(-1, len(self.pp), 3)
-        flat = cp.reshape(len(self.c), -1)
-        return root, flat, self.cc + (damping + LEAST_DAMPING) * np.diag(np.diag(self.cc)) - flat @ flat.T
+        n_shared = len(self.intrinsics_point) * len(PARAMETERS)
+        n_images = (len(self.c) - n_shared) // 6
+        order = np.argsort(self.image, kind="stable")
+        starts = np.concatenate([[0], np.cumsum(np.bincount(self.image, minlength=n_images))])
+        blocks = (self.pose_point @ root[self.point])[order], self.point[order], starts
+        poses = sparse.bsr_matrix(blocks, shape=(6 * n_images, 3 * len(self.pp)))
+        shared = np.swapaxes(self.intrinsics_point @ root, 1, 2).reshape(n_shared, -1)
+        cp = sparse.vstack([poses.tocsr(), sparse.csr_matrix(shared)], format="csr")
+        damped = self.cc + (damping + LEAST_DAMPING) * sparse.diags(self.cc.diagonal())
+        return root, cp, (damped - cp @ cp.T).tocsc()
 
     def step(self, damping: float) -> tuple[Float, Float]:
         """Return the damped step of poses and intrinsics (D,) and of the points (N, 3)."""
         root, cp, matrix = self.eliminated(damping)
         p = np.einsum("nji,nj->ni", root, self.p).ravel()
-        scale = 1.0 / np.sqrt(np.diag(self.cc))
-        dc = scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * (self.c - cp @ p))
+        dc = self._solved(matrix, self.c - cp @ p)
         return dc, np.einsum("nij,nj->ni", root, (p - cp.T @ dc).reshape(-1, 3))
 
     def intrinsics_covariance(self) -> Float:
         """Return the covariance (6K, 6K) of the free intrinsics, poses and points marginalised."""
-        scale = 1.0 / np.sqrt(np.diag(self.cc))
-        covariance = np.linalg.inv(self.eliminated(0.0)[2] * np.outer(scale, scale)) * np.outer(scale, scale)
-        first = len(self.c) - len(self.intrinsics_point) * len(PARAMETERS)
-        return np.asarray(covariance[first:, first:])
+        n_shared = len(self.intrinsics_point) * len(PARAMETERS)
+        wanted = np.eye(len(self.c))[:, len(self.c) - n_shared :]
+        return self._solved(self.eliminated(0.0)[2], wanted)[len(self.c) - n_shared :]
+
+    def _solved(self, matrix: Any, right: Float) -> Float:
+        """Solve the system of C scaled to a unit diagonal of `cc`, where rotations and metres are alike."""
+        from scipy import sparse
+        from scipy.sparse.linalg import splu
+
+        scale = 1.0 / np.sqrt(self.cc.diagonal())
+        scaled = (sparse.diags(scale) @ matrix @ sparse.diags(scale)).tocsc()
+        columns = scale.reshape(-1, *[1] * (right.ndim - 1))
+        solver = splu(scaled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        return np.asarray(columns * solver.solve(columns * right))
 
 
 @dataclass(frozen=True)
@@ -131,16 +148,16 @@ class Bundle:
         residual = root[:, None] * residual
         by_pose, by_intrinsics, by_point = (root[:, None, None] * jacobian for jacobian in self.jacobians(state))
         cc, c = self._poses_and_intrinsics(by_pose, by_intrinsics, residual)
-        self._add_priors(cc, c, state)
+        prior_cc, prior_c = self._priors(state)
         point_t, intrinsics_t = np.swapaxes(by_point, 1, 2), np.swapaxes(by_intrinsics, 1, 2)
         n = len(state.points)
         shared = [self._by_point(intrinsics_t @ by_point * self._rows(key)[:, None, None], n) for key in self.free]
         return NormalEquations(
-            cc=cc,
+            cc=cc + prior_cc,
             pp=self._by_point(point_t @ by_point, n),
             pose_point=np.swapaxes(by_pose, 1, 2) @ by_point,
             intrinsics_point=np.array(shared).reshape(-1, n, len(PARAMETERS), 3),
-            c=c,
+            c=c + prior_c,
             p=self._by_point(np.einsum("mki,mk->mi", by_point, residual), n),
             image=self.image,
             point=self.point,
@@ -199,24 +216,45 @@ class Bundle:
         total[self.point[starts]] = np.add.reduceat(values, starts)
         return total
 
-    def _poses_and_intrinsics(self, by_pose: Float, by_intrinsics: Float, residual: Float) -> tuple[Float, Float]:
-        first = 6 * len(self.keys)
-        cc, c = np.zeros((first + self.mean.size,) * 2), np.zeros(first + self.mean.size)
-        for image, key in enumerate(self.keys):
-            rows = np.flatnonzero(self.image == image)
-            columns, jacobian = 6 * image + np.arange(6), by_pose[rows]
-            if key in self.free:
-                own = first + len(PARAMETERS) * self.free.index(key) + np.arange(len(PARAMETERS))
-                columns, jacobian = np.append(columns, own), np.concatenate([jacobian, by_intrinsics[rows]], axis=2)
-            jacobian = jacobian.reshape(-1, len(columns))
-            cc[np.ix_(columns, columns)] += jacobian.T @ jacobian
-            c[columns] += jacobian.T @ residual[rows].ravel()
-        return cc, c
+    def _poses_and_intrinsics(self, by_pose: Float, by_intrinsics: Float, residual: Float) -> tuple[Any, Float]:
+        """Return the sparse matrix (D, D) and the right side (D,) of the poses and intrinsics."""
+        from scipy import sparse
 
-    def _add_priors(self, cc: Float, c: Float, state: State) -> None:
-        for k, deviation in enumerate(self.deviation(state)):
-            weighted = self.whitening[k].T / (1.0 + deviation**2 / STUDENT)
-            first = 6 * len(self.keys) + len(PARAMETERS) * k
-            block = slice(first, first + len(PARAMETERS))
-            cc[block, block] += weighted @ self.whitening[k]
-            c[block] -= weighted @ deviation
+        n_images, n_keys = len(self.keys), len(self.free)
+        pose_t, intrinsics_t = np.swapaxes(by_pose, 1, 2), np.swapaxes(by_intrinsics, 1, 2)
+        key = np.array([self.free.index(k) if k in self.free else -1 for k in self.keys])
+        of_free = np.flatnonzero(key >= 0)
+        poses = sparse.block_diag(self._by_image(pose_t @ by_pose))
+        mixed = sparse.lil_matrix((6 * n_images, 6 * n_keys))
+        own = np.zeros((n_keys, 6, 6))
+        crossed, squared = self._by_image(pose_t @ by_intrinsics), self._by_image(intrinsics_t @ by_intrinsics)
+        for image in of_free:
+            mixed[6 * image : 6 * image + 6, 6 * key[image] : 6 * key[image] + 6] = crossed[image]
+            own[key[image]] += squared[image]
+        right = np.zeros((n_images + n_keys, 6))
+        right[:n_images] = self._by_image(np.einsum("mki,mk->mi", by_pose, residual))
+        gradient = self._by_image(np.einsum("mki,mk->mi", by_intrinsics, residual))
+        np.add.at(right, n_images + key[of_free], gradient[of_free])
+        if n_keys == 0:
+            return poses.tocsr(), right.ravel()
+        return sparse.bmat([[poses, mixed], [mixed.T, sparse.block_diag(own)]], format="csr"), right.ravel()
+
+    def _by_image(self, values: Float) -> Float:
+        order = np.argsort(self.image, kind="stable")
+        rows = self.image[order]
+        starts = np.flatnonzero(np.diff(rows, prepend=-1))
+        total = np.zeros((len(self.keys), *values.shape[1:]))
+        total[rows[starts]] = np.add.reduceat(values[order], starts)
+        return total
+
+    def _priors(self, state: State) -> tuple[Any, Float]:
+        """Return what the priors add to matrix (D, D) and right side (D,)."""
+        from scipy import sparse
+
+        first = 6 * len(self.keys)
+        blocks, right = [sparse.csr_matrix((first, first))], [np.zeros(first)]
+        for whitening, deviation in zip(self.whitening, self.deviation(state), strict=True):
+            weighted = whitening.T / (1.0 + deviation**2 / STUDENT)
+            blocks.append(sparse.csr_matrix(weighted @ whitening))
+            right.append(-weighted @ deviation)
+        return sparse.block_diag(blocks, format="csr"), np.concatenate(right)

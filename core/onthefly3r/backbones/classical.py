@@ -12,9 +12,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ..geometry.camera import Camera, PixelMap
 from ..options import BackboneOptions
-from ..records import Features, LocalModel, LocalView, Rejection, Subset, WorkingImage
+from ..records import Features, LocalModel, LocalView, Observations, Rejection, Subset, WorkingImage
 from .base import BackboneSpec
 from .dense import dense_views, sparse_view
 from .features import FeatureStore
@@ -106,7 +108,25 @@ class ClassicalBackbone:
             if keys[i] not in calibrations
         }
         notes = {"reprojection_px": model.mean_reprojection_px, "sparse_points": float(len(model.points))}
-        return LocalModel(views, calibrations=calibrated, notes=notes)
+        observations = _observations(model, images, features)
+        return LocalModel(views, calibrations=calibrated, observations=observations, notes=notes)
+
+
+def _observations(
+    model: SparseModel, images: Mapping[int, WorkingImage], features: Mapping[int, Features]
+) -> Observations:
+    tracks = [(index, track) for index, track in sorted(model.tracks.items()) if index in model.local_from_cam]
+    pixels = [
+        images[index].working_from_photo.inverse().apply(features[index].pixels[track.features].astype(float))
+        for index, track in tracks
+    ]
+    return Observations(
+        image=np.concatenate([np.full(len(track.points), index, np.int32) for index, track in tracks]),
+        feature=np.concatenate([track.features for _, track in tracks]).astype(np.int32),
+        pixel=np.concatenate(pixels).astype(np.float32),
+        point=np.concatenate([track.points for _, track in tracks]).astype(np.int32),
+        points=model.points.astype(np.float32),
+    )
 
 
 def _working_camera(image: WorkingImage, calibrations: Mapping[str, Camera]) -> Camera:

@@ -104,6 +104,12 @@ def self_calibrate(
     )
 
 
+def effective_weight(image: Int) -> Float:
+    """Return the weights (M,) under which the observations of one image, named by its row, count as a few."""
+    count = np.bincount(image)
+    return np.asarray(np.minimum(1.0, EFFECTIVE_OBSERVATIONS / np.maximum(count, 1))[image])
+
+
 def _bundle(
     model: SparseModel,
     features: Mapping[int, Features],
@@ -126,12 +132,11 @@ def _bundle(
         rows.append(np.full(len(chosen), row))
     image, point = np.concatenate(rows), np.concatenate(points)
     order = np.argsort(point, kind="stable")
-    count = np.bincount(image, minlength=len(images))
     bundle = Bundle(
         image=image[order],
         point=point[order],
         pixel=np.concatenate(pixels)[order],
-        weight=np.minimum(1.0, EFFECTIVE_OBSERVATIONS / np.maximum(count, 1))[image[order]],
+        weight=effective_weight(image[order]),
         keys=image_keys,
         free=free,
         cameras=model.cameras,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from itertools import islice
 
 from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.transforms import Rigid3, Sim3
-from ..records import CompactReference, Edge, Frame, FrameEdge, NewFrame, Submap
-from .journal import rigid3_from_json, rigid3_to_json, sim3_from_json, sim3_to_json, submap_from_json
+from ..records import CompactReference, Edge, Frame, FrameEdge, NewFrame, Observations, Submap
+from .journal import camera_from_json, rigid3_from_json, rigid3_to_json, sim3_from_json, sim3_to_json, submap_from_json
 from .store import Store
 
 
@@ -29,6 +30,7 @@ class MapState:
         self.calibrations: dict[str, Camera] = {}
         self.spacing = float("nan")  # l_scene, map units
         self._moved: dict[int, Rigid3] = {}
+        self._refined: dict[int, Sim3] = {}
 
     @classmethod
     def load(cls, store: Store) -> MapState:
@@ -42,6 +44,9 @@ class MapState:
                     state.spacing = float(value)
                 elif kind == "submap_poses":
                     state.map_from_submap.update({int(k): sim3_from_json(v) for k, v in value.items()})
+                elif kind == "refined":
+                    state._refined.update({int(k): sim3_from_json(v) for k, v in value["frames"].items()})
+                    state.calibrations.update({k: camera_from_json(v) for k, v in value["calibrations"].items()})
                 elif kind == "frame_poses":
                     state._moved.update({int(k): rigid3_from_json(v) for k, v in value.items()})
             except (KeyError, TypeError, ValueError) as error:
@@ -60,20 +65,25 @@ class MapState:
         """Return the pose of an accepted frame in the map."""
         if index in self._moved:
             return self._moved[index]
-        frame = self.frames[index]
-        return self.map_from_submap[frame.submap].apply_to_pose(frame.submap_from_cam)
+        return self.submap_pose_of(index).apply_to_pose(self.frames[index].submap_from_cam)
 
     def reference(self, index: int) -> CompactReference:
         """Return H_i of an accepted frame, in the frame of its submap."""
         return self._store.reference(index)
 
     def submap_pose_of(self, index: int) -> Sim3:
-        """Return map_from_submap of the submap that predicted a frame."""
-        return self.map_from_submap[self.frames[index].submap]
+        """Return map_from_submap of the submap that predicted a frame, as refined for this frame if it was."""
+        return self._refined.get(index) or self.map_from_submap[self.frames[index].submap]
 
-    def commit(self, submap: Submap, frames: Sequence[NewFrame], calibrations: Mapping[str, Camera]) -> None:
+    def commit(
+        self,
+        submap: Submap,
+        frames: Sequence[NewFrame],
+        calibrations: Mapping[str, Camera],
+        observations: Observations | None = None,
+    ) -> None:
         """Add one validated batch (Eq. 14); it is on disk before it counts."""
-        self._store.commit(submap, frames)
+        self._store.commit(submap, frames, observations)
         self._take(submap, calibrations)
 
     def set_spacing(self, spacing: float) -> None:
@@ -93,6 +103,13 @@ class MapState:
         """Take over optimised submap poses; cameras, references and cloud follow."""
         self.map_from_submap.update(map_from_submap)
         self._store.note("submap_poses", {str(k): sim3_to_json(v) for k, v in map_from_submap.items()})
+
+    def move_refined(self, map_from_submap: Mapping[int, Sim3], calibrations: Mapping[str, Camera]) -> None:
+        """Take over refined frames, each with its references and its part of the cloud, and intrinsics."""
+        self._refined.update(map_from_submap)
+        self.calibrations.update(calibrations)
+        frames = {str(k): sim3_to_json(v) for k, v in map_from_submap.items()}
+        self._store.note("refined", {"frames": frames, "calibrations": {k: asdict(c) for k, c in calibrations.items()}})
 
     def move_frames(self, map_from_cam: Mapping[int, Rigid3]) -> None:
         """Take over optimised camera poses only, as the paper's SE(3) graph does; the cloud stays."""

@@ -10,7 +10,7 @@ import json
 import os
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.arrays import Float, UInt8
-from ..records import CompactReference, NewFrame, Submap
+from ..records import CompactReference, NewFrame, Observations, Submap
 from .journal import submap_to_json
 
 CACHED_REFERENCES = 256  # about 40 KB each
@@ -45,7 +45,7 @@ class Store:
         self._recent: OrderedDict[int, CompactReference] = OrderedDict()
         self._chunks.mkdir(parents=True, exist_ok=True)
 
-    def commit(self, submap: Submap, frames: Sequence[NewFrame]) -> None:
+    def commit(self, submap: Submap, frames: Sequence[NewFrame], observations: Observations | None = None) -> None:
         """Write one batch: the chunk first, then the journal line that makes it count."""
         arrays: dict[str, Any] = {}
         for new in frames:
@@ -56,6 +56,8 @@ class Store:
             arrays[f"{prefix}/points"] = new.points
             arrays[f"{prefix}/rgb"] = new.rgb
             arrays[f"{prefix}/confidence"] = new.confidence
+        if observations is not None:
+            arrays |= {f"observations/{name}": value for name, value in vars(observations).items()}
         path = self._chunk_path(submap.number)
         temporary = path.with_suffix(".part.npz")
         np.savez(temporary, **arrays)
@@ -107,6 +109,14 @@ class Store:
                 yield StoredPoints(
                     index, submap, chunk[f"{index}/points"], chunk[f"{index}/rgb"], chunk[f"{index}/confidence"]
                 )
+
+    def stream_observations(self) -> Iterator[tuple[int, Observations]]:
+        """Yield what the backbone tied together in each submap, by its number; nothing where it does not tell."""
+        names = [field.name for field in fields(Observations)]
+        for submap in dict.fromkeys(self._chunk_of.values()):
+            with np.load(self._chunk_path(submap), allow_pickle=False) as chunk:
+                if f"observations/{names[0]}" in chunk:
+                    yield submap, Observations(**{name: chunk[f"observations/{name}"] for name in names})
 
     def _chunk_path(self, submap: int) -> Path:
         return self._chunks / f"{submap:06d}.npz"
