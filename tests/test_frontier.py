@@ -21,27 +21,25 @@ def line(count: int, index: RetrievalIndex | None = None) -> RetrievalIndex:
     return index
 
 
-def frontier_of(index: RetrievalIndex, count: int, placed: list[int]) -> Frontier:
+def frontier_of(index: RetrievalIndex, count: int) -> Frontier:
     frontier = Frontier()
     frontier.add(list(range(count)), index)
-    index.accept(placed)
-    frontier.placed(placed, index)
     return frontier
 
 
-def test_images_next_to_the_map_are_ready_and_far_ones_wait() -> None:
+def test_images_next_to_the_references_are_supported_and_far_ones_are_not() -> None:
     index = line(9)
-    frontier = frontier_of(index, 9, [0, 1, 2, 3])
-    assert frontier.ready([4, 5, 6, 7, 8]) == [4, 5]
-    assert frontier.ready([8, 6, 7]) == [6]  # nothing is ready: the nearest
+    supported = frontier_of(index, 9).support([4, 5, 6, 7, 8], [0, 1, 2, 3], index)
+    assert [image for image in (4, 5, 6, 7, 8) if supported([image], [0, 1, 2, 3])] == [4, 5]
+    assert not supported([4], [0])
 
 
-def test_readiness_grows_with_the_map() -> None:
-    index = line(12)
-    frontier = frontier_of(index, 12, [0, 1, 2, 3])
-    index.accept([4, 5])
-    frontier.placed([4, 5], index)
-    assert frontier.ready([6, 7, 8]) == [6, 7]
+def test_images_hang_on_those_before_them_in_the_batch() -> None:
+    index = line(9)
+    supported = frontier_of(index, 9).support([4, 5, 6, 7, 8], [0, 1, 2, 3], index)
+    assert supported([4, 5, 6, 7], [0, 1, 2, 3])
+    assert not supported([7, 6, 5, 4], [0, 1, 2, 3])  # the first hangs on the references alone
+    assert not supported([4, 8], [0, 1, 2, 3])
 
 
 @pytest.mark.parametrize("step", [1, 4, 9])
@@ -50,16 +48,15 @@ def test_images_that_arrive_one_by_one_are_judged_like_all_at_once(step: int) ->
     frontier = Frontier()
     for start in range(0, 9, step):
         frontier.add(list(range(start, min(start + step, 9))), index)
-    index.accept([0, 1, 2, 3])
-    frontier.placed([0, 1, 2, 3], index)
-    assert frontier.ready([4, 5, 6, 7, 8]) == [4, 5]
+    supported = frontier.support([4, 5, 6, 7, 8], [0, 1, 2, 3], index)
+    assert [image for image in (4, 5, 6, 7, 8) if supported([image], [0, 1, 2, 3])] == [4, 5]
 
 
-def test_a_far_image_is_ready_where_nothing_is_nearer() -> None:
+def test_a_far_image_is_supported_where_nothing_is_nearer() -> None:
     index = line(4)
     angle = np.radians(ANGLE_DEG * 7)
     index.add(4, np.array([np.cos(angle), np.sin(angle), 0.0], np.float32))
-    assert frontier_of(index, 5, [0, 1, 2, 3]).ready([4]) == [4]
+    assert frontier_of(index, 5).support([4], [0, 1, 2, 3], index)([4], [0, 1, 2, 3])
 
 
 def test_orphans_are_images_whose_own_references_were_pruned() -> None:

@@ -258,13 +258,19 @@ class Engine:
                 return fixed_subset(self._waiting, self.state.last_accepted(options.subset_references), options)
             window = self._waiting[: options.batch_size]
             if options.lookahead > 1:
-                ready = self._frontier.ready(self._waiting)
-                window = self._index.best_tied(ready, max(options.lookahead, options.batch_size))
+                window = self._index.best_tied(self._waiting, max(options.lookahead, options.batch_size))
             neighbours = propose_references(window, self._index, options.references, options.gps_candidates)
             similarity = self._index.similarities(window, window)
             row = {index: i for i, index in enumerate(window)}
-            subset = build_subset(window, neighbours, lambda a, b: float(similarity[row[a], row[b]]), options)
-            return subset if options.lookahead == 1 else self._frontier.supported(subset, self._index)
+
+            def similar(a: int, b: int) -> float:
+                return float(similarity[row[a], row[b]])
+
+            if options.lookahead == 1:
+                return build_subset(window, neighbours, similar, options)
+            references = sorted({n.index for found in neighbours.values() for n in found})
+            support = self._frontier.support(window, references, self._index)
+            return build_subset(window, neighbours, similar, options, support)
 
     def _reconstruct_and_register(self, subset: Subset) -> tuple[Registration | Rejection, LocalModel | None]:
         """Infer, register and validate; with context tokens, drop incompatible references and infer once more."""
@@ -322,7 +328,6 @@ class Engine:
         for index in placed:
             self.rejections.pop(index, None)
         self._index.accept(placed)
-        self._frontier.placed(placed, self._index)
         self._retry.placed(placed, self._index)
 
     # ------------------------------------------------------------------ rejection and retry

@@ -1,13 +1,13 @@
-"""Which waiting images border on the map: those whose nearest neighbours are in it already.
+"""Which images may join a subset: those whose nearest neighbours are in it.
 
 Retrieval always finds k frames, however far away. An image that is reconstructed together with frames that do not see
 its ground may be put anywhere, and on even ground nothing betrays it. So an image waits while images that are much
-more similar to it than any frame of the map are still to be placed.
+more similar to it than what the subset holds are still to be placed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -16,24 +16,23 @@ from ..records import Subset
 from .index import RetrievalIndex
 
 NEIGHBOURS = 3  # similarities of so many are averaged: fewer references are not enough to register an image
-READY = 0.8  # similarity to the map over similarity to everything seen, from which an image is ready
+READY = 0.8  # similarity to the subset over similarity to everything seen, from which an image is ready
 BLOCK = 1000  # rows of similarities at a time
 
 
 class Frontier:
-    """The highest similarities of every described image to all others, and to those in the map."""
+    """The highest similarities of every described image to all others."""
 
     def __init__(self) -> None:
         self._row_of: dict[int, int] = {}
         self._to_all: Float = np.zeros((0, NEIGHBOURS), np.float32)  # in no order
-        self._to_map: Float = np.zeros((0, NEIGHBOURS), np.float32)
 
     def add(self, new: Sequence[int], retrieval: RetrievalIndex) -> None:
         """Take described images; `retrieval` knows them already."""
         before = list(self._row_of)
         self._row_of.update({index: len(before) + k for k, index in enumerate(new)})
         empty = np.zeros((len(new), NEIGHBOURS), np.float32)
-        self._to_all, self._to_map = np.vstack([self._to_all, empty]), np.vstack([self._to_map, empty])
+        self._to_all = np.vstack([self._to_all, empty])
         known = list(self._row_of)
         for start in range(0, len(new), BLOCK):
             block = new[start : start + BLOCK]
@@ -44,30 +43,26 @@ class Frontier:
             if before:
                 self._to_all[: len(before)] = _merged(self._to_all[: len(before)], similarity[:, : len(before)].T)
 
-    def placed(self, new: Sequence[int], retrieval: RetrievalIndex) -> None:
-        """Note that images are in the map now."""
-        if new:
-            self._to_map = _merged(self._to_map, retrieval.similarities(list(self._row_of), new))
+    def support(
+        self, images: Sequence[int], references: Sequence[int], retrieval: RetrievalIndex
+    ) -> Callable[[Sequence[int], Sequence[int]], bool]:
+        """Return the test whether a batch hangs together with its references.
 
-    def ready(self, waiting: Sequence[int]) -> list[int]:
-        """Return the waiting images that border on the map, in their order; the one nearest to it where none does."""
-        if not waiting:
-            return []
-        return self._above(waiting, self._to_map[[self._row_of[index] for index in waiting]])
+        In the batch's order, the near neighbours of each image must be among the references and the images before it:
+        so the first one hangs on the map alone, and the others need not all see what the references see.
+        """
+        to_references = retrieval.similarities(images, references)
+        to_images = retrieval.similarities(images, images)
+        row = {index: i for i, index in enumerate(images)}
+        column = {index: i for i, index in enumerate(references)}
+        least = READY * self._to_all[[self._row_of[index] for index in images]].mean(axis=1)
 
-    def supported(self, subset: Subset, retrieval: RetrievalIndex) -> Subset:
-        """Return a subset without the new images whose near neighbours its references are not, but never empty."""
-        if not subset.references:
-            return subset
-        to_references = _highest(retrieval.similarities(subset.new, subset.references))
-        return Subset(subset.references, tuple(self._above(subset.new, to_references)))
+        def supported(batch: Sequence[int], kept: Sequence[int]) -> bool:
+            rows, columns = [row[index] for index in batch], [column[index] for index in kept]
+            joined = np.hstack([to_references[np.ix_(rows, columns)], np.tril(to_images[np.ix_(rows, rows)], -1)])
+            return bool((_highest(joined).mean(axis=1) >= least[rows]).all())
 
-    def _above(self, images: Sequence[int], similar: Float) -> list[int]:
-        """Return the images that are as similar to something, (N, NEIGHBOURS), as `READY` asks; the best if none is."""
-        to_all = self._to_all[[self._row_of[index] for index in images]]
-        share = similar.mean(axis=1) / np.maximum(to_all.mean(axis=1), 1e-6)
-        above = [index for index, value in zip(images, share, strict=True) if value >= READY]
-        return above or [images[int(np.argmax(share))]]
+        return supported
 
 
 def orphans(subset: Subset, kept: Sequence[int], retrieval: RetrievalIndex, min_shared: int) -> list[int]:

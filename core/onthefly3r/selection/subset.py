@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from itertools import islice
 
 from ..options import SelectionOptions
 from ..records import Neighbour, Subset
 
 Similarity = Callable[[int, int], float]
+Support = Callable[[Sequence[int], Sequence[int]], bool]  # (images, references): do these speak for all of those?
 
 STARTS = 8  # best tied images that are tried as the start of a batch
 
@@ -35,21 +37,23 @@ def build_subset(
     neighbours: Mapping[int, Sequence[Neighbour]],
     similarity: Similarity,
     options: SelectionOptions,
+    supported: Support = lambda images, references: True,
 ) -> Subset:
     """Return the next subset B_k = R_k + Q_k (Eq. 8) from the images of the look-ahead, oldest first.
 
     With a look-ahead of one the batch grows in arrival order and stops at the first image that does not fit, as in
     the paper. A longer look-ahead starts at the image that is best tied to the map and always admits the best
-    fitting image within it; of a few such starts the first that fills the batch wins, so that shuffled input fills
-    batches too.
+    fitting image within it whose own references stay in the subset (`supported`); of a few such starts the first
+    that fills the batch wins, so that shuffled input fills batches too.
     """
     if options.lookahead == 1:
-        batch = _grow(waiting, waiting[0], neighbours, similarity, options)
+        batch = _grow(waiting, waiting[0], neighbours, similarity, options, supported)
     else:
-        best_tied = sorted(waiting, key=lambda q: -_support(neighbours[q]))[:STARTS]
+        best_tied = sorted(waiting, key=lambda q: -_support(neighbours[q]))
+        firm = (q for q in best_tied if supported([q], dominant_references([q], neighbours, options.subset_references)))
         batch = []
-        for start in best_tied:
-            grown = _grow(waiting, start, neighbours, similarity, options)
+        for start in list(islice(firm, STARTS)) or best_tied[:1]:
+            grown = _grow(waiting, start, neighbours, similarity, options, supported)
             if len(grown) > len(batch):
                 batch = grown
             if len(batch) == options.batch_size:
@@ -64,16 +68,23 @@ def _grow(
     neighbours: Mapping[int, Sequence[Neighbour]],
     similarity: Similarity,
     options: SelectionOptions,
+    supported: Support,
 ) -> list[int]:
     """Return the batch that grows around one image by Eq. 6-7."""
     batch, left = [start], [q for q in window if q != start]
     while left and len(batch) < options.batch_size:
         dominant = set(dominant_references(batch, neighbours, options.references))
-        best = left[0]
-        if options.lookahead > 1:
-            best = max(left, key=lambda q: _fit(q, batch, dominant, neighbours, similarity))
-        overlap, closeness = _fit(best, batch, dominant, neighbours, similarity)
-        if overlap < options.min_shared_references or closeness < options.min_similarity:  # Eq. 7
+        fit = {q: _fit(q, batch, dominant, neighbours, similarity) for q in left}
+        ranked = left[:1] if options.lookahead == 1 else sorted(left, key=lambda q: fit[q], reverse=True)
+        admitted = (
+            q
+            for q in ranked
+            if fit[q][0] >= options.min_shared_references  # Eq. 7
+            and fit[q][1] >= options.min_similarity
+            and supported([*batch, q], dominant_references([*batch, q], neighbours, options.subset_references))
+        )
+        best = next(admitted, None)
+        if best is None:
             break
         batch.append(best)
         left.remove(best)
