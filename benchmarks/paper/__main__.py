@@ -24,6 +24,7 @@ from .strategies import STRATEGIES
 from .tables import geometry_table, macro_table, per_scene_table, seven_scenes_table
 
 PACKAGES = ("onthefly3r", "numpy", "scipy", "gtsam", "pycolmap", "embreex")
+SURVEYS = ("joint", "HAV-in-order", "HAV", "Residence", "Campus")
 SETS = ("brighton_beach", "caliterra", "sheffield_cross")
 
 
@@ -116,7 +117,7 @@ def _parser() -> argparse.ArgumentParser:
         "--scenario",
         nargs="+",
         choices=simulated.SCENARIOS,
-        default=["joint", "HAV-in-order", "HAV", "Residence", "Campus"],
+        default=list(SURVEYS),
     )
     command.add_argument("--seed", nargs="+", type=int, default=[0, 1, 2])
     _common(command, Path("evidence-simulated"))

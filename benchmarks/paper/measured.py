@@ -107,7 +107,7 @@ def _has_cloud(path: Path) -> bool:
 
 
 def _price(*paths: Path) -> tuple[float | None, float | None]:
-    """Return (seconds, peak GPU memory in GB) from the first of these files that is there; the last may be our report."""
+    """Return (seconds, peak GPU memory in GB) from the first of these files that is there; one may be our report."""
     path = next((path for path in paths if path.is_file()), None)
     if path is None:
         return None, None

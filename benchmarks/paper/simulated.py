@@ -47,6 +47,7 @@ SCENARIOS = {
     for scenario in (
         Scenario("small", 120, 6, 2, True, NOISE, FAULTS),
         Scenario("joint", 58, 5, 1, False, NOISE, replace(FAULTS, bad_view_rate=0.0)),
+        Scenario("HAV-in-order", 424, 14, 1, False, NOISE, FAULTS),
         Scenario("HAV", 424, 14, 2, False, NOISE, FAULTS),
         Scenario("Residence", 2582, 33, 2, True, NOISE, FAULTS),
         Scenario("Campus", 5871, 50, 3, True, NOISE, FAULTS),
