@@ -163,6 +163,20 @@ def test_a_loop_spreads_the_error_of_a_chain() -> None:
     assert 1.0 < closed < 1.02**1.5
 
 
+def test_the_tree_takes_the_most_trusted_edges_first() -> None:
+    from onthefly3r.records import Edge
+
+    def step(metres: float) -> Sim3:
+        return Sim3(1.0, np.eye(3), np.array([metres, 0.0, 0.0]))
+
+    nothing = [Piece(k, {}, {}, {}) for k in range(3)]
+    precise, vague = 1e-6 * np.eye(7), 1e6 * np.eye(7)
+    chain = [Edge(0, 1, step(1.0), precise), Edge(1, 2, step(1.0), precise)]
+    shortcut = Edge(0, 2, step(500.0), vague)
+    assert settle(nothing, [*chain, shortcut], root=0)[2].translation[0] == pytest.approx(2.0, abs=0.01)
+    assert settle(nothing, [shortcut, chain[0]], root=0)[2].translation[0] == pytest.approx(500.0)
+
+
 # ------------------------------------------------------------------ chunks
 
 

@@ -57,24 +57,36 @@ def tie(source: Piece, target: Piece) -> Edge | None:
 def settle(pieces: Sequence[Piece], edges: Sequence[Edge], root: int) -> dict[int, Sim3]:
     """Return map_from_local of every piece that hangs on `root`: spanning tree first, then the Sim(3) pose graph.
 
-    Edges are taken in the order given: the tree prefers earlier ones where pieces are reached at the same distance.
+    Edges are given most trusted first: the tree takes each that joins two trees (Kruskal).
     """
-    neighbours: dict[int, list[tuple[int, Sim3]]] = {piece.number: [] for piece in pieces}
-    for edge in edges:
-        neighbours[edge.source].append((edge.target, edge.source_from_target))
-        neighbours[edge.target].append((edge.source, edge.source_from_target.inverse()))
-    poses = {root: Sim3()}
-    front = [root]
-    while front:
-        reached = []
-        for number in front:
-            for other, number_from_other in neighbours[number]:
-                if other not in poses:
-                    poses[other] = poses[number] @ number_from_other
-                    reached.append(other)
-        front = reached
+    poses = _along(_spanning_tree([piece.number for piece in pieces], edges), root)
     inside = [edge for edge in edges if edge.source in poses]
     return default_solver().solve_sim3(poses, inside, (), fixed=root) if has_loops(len(poses), inside) else poses
+
+
+def _spanning_tree(numbers: Sequence[int], edges: Sequence[Edge]) -> dict[int, list[tuple[int, Sim3]]]:
+    """Return the neighbours of every piece in the tree, each with number_from_neighbour."""
+    tree_of = {number: number for number in numbers}
+    neighbours: dict[int, list[tuple[int, Sim3]]] = {number: [] for number in numbers}
+    for edge in edges:
+        first, second = tree_of[edge.source], tree_of[edge.target]
+        if first != second:
+            tree_of = {number: first if tree == second else tree for number, tree in tree_of.items()}
+            neighbours[edge.source].append((edge.target, edge.source_from_target))
+            neighbours[edge.target].append((edge.source, edge.source_from_target.inverse()))
+    return neighbours
+
+
+def _along(neighbours: Mapping[int, Sequence[tuple[int, Sim3]]], root: int) -> dict[int, Sim3]:
+    """Return root_from_number of everything that a tree reaches from its root."""
+    poses, front = {root: Sim3()}, [root]
+    while front:
+        number = front.pop()
+        for other, number_from_other in neighbours[number]:
+            if other not in poses:
+                poses[other] = poses[number] @ number_from_other
+                front.append(other)
+    return poses
 
 
 def cameras(pieces: Iterable[Piece], map_from_piece: Mapping[int, Sim3], owner: Mapping[int, int]) -> dict[int, Rigid3]:
