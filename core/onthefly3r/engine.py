@@ -83,7 +83,7 @@ class Engine:
         self._pending: list[int] = []  # described only once there are enough to learn from
         self._waiting: list[int] = []
         self._frontier = Frontier()
-        self._retry = RetryQueue(options.registration.max_retries)
+        self._retry = RetryQueue(options.registration.max_retries if options.registration.validation else 0)
         self._refused_seeds: set[int] = set()
         self._described = False
         self._origin: GpsFix | None = None
@@ -94,6 +94,10 @@ class Engine:
     def backbone_name(self) -> str:
         """Name and version of the local reconstructor."""
         return f"{self._backbone.spec.name} {self._backbone.spec.version}"
+
+    @property
+    def _validates_queries(self) -> bool:
+        return self.options.registration.validation and self.options.registration.validate_queries
 
     @property
     def retries(self) -> dict[int, int]:
@@ -212,7 +216,7 @@ class Engine:
         if isinstance(model, Rejection):
             return False
         threshold = self._backbone.spec.confidence_threshold
-        refused = check_seed(model.views, threshold) if self.options.registration.validate_queries else {}
+        refused = check_seed(model.views, threshold) if self._validates_queries else {}
         good = [i for i in seed if i in model.views and i not in refused]
         spacing = scene_spacing({i: model.views[i] for i in good}, threshold)
         seen = len(seed) - len(model.left_out)
@@ -279,7 +283,7 @@ class Engine:
             return model, None
         subset = self._put_back(subset, model.left_out)
         outcome = self._register(model, subset)
-        if isinstance(outcome, Rejection) and self._backbone.spec.has_tokens:
+        if isinstance(outcome, Rejection) and self._backbone.spec.has_tokens and self.options.registration.validation:
             minimum = self.options.registration.min_references
             dropped = incompatible_references(subset, model.views, minimum)
             if dropped:
@@ -292,7 +296,7 @@ class Engine:
 
     def _without_orphans(self, outcome: Registration, subset: Subset) -> Registration | Rejection:
         """Refuse the new images whose own references were pruned: nothing kept speaks for where they are."""
-        if not self.options.registration.validate_queries:
+        if not self._validates_queries:
             return outcome
         least = self.options.selection.min_shared_references
         lost = [i for i in orphans(subset, outcome.alignment.references, self._index, least) if i in outcome.accepted]

@@ -27,7 +27,8 @@ MIN_USED_SHARE = 0.5
 MIN_SIDEWAYS = 0.1  # sideways over lengthwise extent: along one line positions leave the roll open
 MIN_EXTENT = 5.0  # sideways, in sigmas of the positions: nearer together they say nothing of the map's shape
 HUBER = 1.345
-PRIOR_STEPS = 5
+PRIOR_STEPS = 8
+MAX_STEP = 0.2  # rad, or of the logarithm of scale, at a time: positions of one place tell nothing of either
 MIN_EIGENVALUE = 1e-4  # of the largest: directions of a submap that its positions do not determine
 VOTE_SIGMAS = 5.0
 VOTE_SHARE = 0.2  # of the distance to the references, by which the map may be warped or turned here
@@ -165,7 +166,9 @@ def _prior(submap: int, pose: Sim3, points: Float, targets: Float, root: Float) 
         values, vectors = np.linalg.eigh(information)
         known = values > MIN_EIGENVALUE * values[-1]
         values, vectors = values[known], vectors[:, known]
-        step = np.linalg.solve(from_origin, vectors @ ((vectors.T @ gradient) / values))
+        step = vectors @ ((vectors.T @ gradient) / values)
+        step = step * min(1.0, MAX_STEP / max(float(np.abs(step[[0, 1, 2, 6]]).max()), 1e-12))
+        step = np.linalg.solve(from_origin, step)
         pose = pose @ Sim3(float(np.exp(step[6])), rotation_exp(step[:3]), step[3:6])
     information = from_origin.T @ ((vectors * values) @ vectors.T) @ from_origin
     return PosePrior(submap, pose, np.asarray(information))

@@ -22,7 +22,13 @@ from ..records import (
 from ..registration.align import align
 from ..registration.geometric import only, prune_references
 from ..registration.references import correspond
-from ..registration.validate import PoseResidual, reference_points_in_map, validate_query, validate_references
+from ..registration.validate import (
+    PoseResidual,
+    ReferenceVerdict,
+    reference_points_in_map,
+    validate_query,
+    validate_references,
+)
 from .state import MapState
 
 
@@ -53,13 +59,15 @@ def register(
     placed = tuple(i for i in subset.new if i in model.views)
     if not placed:
         return Rejection(subset.new, "backbone", "no new image could be tied to the subset")
-    outcome = prune_references(
-        model,
-        pairs,
-        map_from_cam,
-        options.min_references,
-        lambda alignment: validate_references(model, alignment, map_from_cam, state.spacing, options),
-    )
+
+    def validate(alignment: Alignment) -> ReferenceVerdict:
+        return validate_references(model, alignment, map_from_cam, state.spacing, options)
+
+    if options.validation:
+        outcome = prune_references(model, pairs, map_from_cam, options.min_references, validate)
+    else:
+        aligned = align(pairs, subset.new)
+        outcome = aligned if isinstance(aligned, Rejection) else (aligned, validate(aligned))
     if isinstance(outcome, Rejection):
         return Rejection(subset.new, outcome.stage, outcome.reason, outcome.numbers)
     alignment, verdict = outcome
@@ -68,7 +76,7 @@ def register(
         Rejection((i,), "backbone", "could not be placed in its subset") for i in subset.new if i not in model.views
     ]
     accepted = list(placed)
-    if options.validate_queries:
+    if options.validation and options.validate_queries:
         map_points = reference_points_in_map({i: references[i] for i in kept}, {i: poses[i] for i in kept})
         local_from_map = alignment.map_from_local.inverse()
         for index in placed:

@@ -16,9 +16,6 @@ from .references import MAX_PAIRS_PER_REFERENCE, spread_sample
 MIN_OVERLAP_POINTS = 15
 DEPTH_TOLERANCE = 0.06  # relative; terrain steps and occlusions exceed it, so only a share must agree
 MIN_AGREEING_SHARE = 0.5
-# A reference may disagree with the others by so many of their own median residual before it counts as bad,
-# even where the absolute gate of Eq. 13 would let it pass.
-RELATIVE_GATE = 6.0
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,8 @@ def validate_references(
     turned = [r for r in residuals if r.rotation_deg > options.max_rotation_deg]
     median = float(np.median([r.translation for r in residuals]))
     # The floor keeps a very tight group from condemning a reference that is merely a little less tight.
-    apart = [r for r in residuals if r.translation > max(RELATIVE_GATE * median, 0.1 * tau_t)]
+    gate = max(options.reference_gate * median, 0.1 * tau_t) if options.reference_gate else np.inf
+    apart = [r for r in residuals if r.translation > gate]
     reason = ""
     if abs(np.log(ratio)) > np.log(options.max_scale_ratio):
         reason = "implausible scale"
