@@ -8,12 +8,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from .backbones.base import Backbone
 from .errors import Cancelled, PhotographError
+from .geometry.arrays import Float
 from .geometry.transforms import Sim3
 from .intake.cache import ImageCache
 from .mapping.frames import new_frame
-from .mapping.gpsprior import pose_priors, tie_to_positions
+from .mapping.gpsprior import GpsTie, gps_disagreement, pose_priors, tie_to_positions
 from .mapping.posegraph import PoseGraphSolver, default_solver, optimise_frames, optimise_submaps
 from .mapping.refine import refine
 from .mapping.register import Registration, check_seed, frame_edges, register
@@ -36,8 +39,8 @@ from .stopwatch import Stopwatch
 SEED_ATTEMPTS = 5
 MIN_SEED_SHARE = 0.5
 # Drift is removed whenever the map has grown by so many submaps, or by this share: the work stays linear.
-OPTIMISE_EVERY = 20
-OPTIMISE_GROWTH = 0.1
+SETTLE_EVERY = 20
+SETTLE_GROWTH = 0.1
 
 
 class Engine:
@@ -87,7 +90,9 @@ class Engine:
         self._refused_seeds: set[int] = set()
         self._described = False
         self._origin: GpsFix | None = None
-        self._optimised_submaps = 0
+        self._settled_submaps = 0
+        self._tie: GpsTie | None = None
+        self._doubted: dict[int, Float] = {}  # where an image landed that its position does not confirm
         self._solver: PoseGraphSolver | None = None
 
     @property
@@ -141,7 +146,7 @@ class Engine:
         """Place what is still waiting, retry what was set aside, and remove the drift."""
         self._describe_pending(force=True)
         self._advance(finishing=True)
-        self._optimise()
+        self._settle()
         if self.options.pose_graph.refine and self.state.frames:
             self._refine()
 
@@ -224,6 +229,7 @@ class Engine:
             return False
         self.state.set_spacing(spacing)
         self._commit(model, Submap(0, Sim3(), (), ()), good)
+        self._settle()
         return True
 
     def _step(self, subset: Subset) -> None:
@@ -251,9 +257,9 @@ class Engine:
         self._commit(model, submap, outcome.accepted)
         for refused in outcome.refused:
             self._set_aside_images(refused)
-        grown = number + 1 - self._optimised_submaps
-        if grown >= max(OPTIMISE_EVERY, OPTIMISE_GROWTH * number) and self.options.pose_graph.pose_graph == "sim3":
-            self._optimise()
+        grown = number + 1 - self._settled_submaps
+        if grown >= max(SETTLE_EVERY, SETTLE_GROWTH * number) and self.options.pose_graph.pose_graph != "se3":
+            self._settle()
 
     def _next_subset(self) -> Subset:
         options = self.options.selection
@@ -319,7 +325,19 @@ class Engine:
     def _register(self, model: LocalModel, subset: Subset) -> Registration | Rejection:
         with self.stopwatch.stage("registration"):
             threshold = self._backbone.spec.confidence_threshold
-            return register(model, subset, self.state, threshold, self.options.registration)
+            check = self._far_from_position if self._tie and self.options.registration.gps_check else None
+            return register(model, subset, self.state, threshold, self.options.registration, check)
+
+    def _far_from_position(self, index: int, centre: Float, references: Mapping[int, Float]) -> float:
+        """Positions ask for a second opinion: two reconstructions that agree on another place outvote them."""
+        disagreement = gps_disagreement(index, centre, references, self.shots, self._tie) if self._tie else 0.0
+        if disagreement > 1.0:
+            before = self._doubted.get(index)
+            self._doubted[index] = centre
+            allowed = self.options.registration.alpha * self.state.spacing
+            if before is not None and np.linalg.norm(centre - before) < allowed:
+                return 0.0
+        return disagreement
 
     def _commit(self, model: LocalModel, submap: Submap, accepted: Iterable[int]) -> None:
         with self.stopwatch.stage("map"):
@@ -348,21 +366,21 @@ class Engine:
 
     # ------------------------------------------------------------------ drift
 
-    def _optimise(self) -> None:
-        kind = self.options.pose_graph.pose_graph
-        if kind == "none" or len(self.state.map_from_submap) < 2:
-            return
+    def _settle(self) -> None:
+        """Tie the map to the positions as it is now, and remove its drift."""
+        graph = self.options.pose_graph
         with self.stopwatch.stage("pose graph"):
-            self._optimised_submaps = len(self.state.map_from_submap)
+            self._settled_submaps = len(self.state.map_from_submap)
+            if graph.gps_priors or self.options.registration.gps_check:
+                self._tie = tie_to_positions(self.state, self.shots, self.options.georeference)
+            if graph.pose_graph == "none" or self._settled_submaps < 2:
+                return
             self._solver = self._solver or default_solver()
-            if kind == "sim3":
-                priors = []
-                if self.options.pose_graph.gps_priors:
-                    tie = tie_to_positions(self.state, self.shots, self.options.georeference)
-                    priors = pose_priors(self.state, tie, self.shots) if tie is not None else []
-                optimise_submaps(self.state, self._solver, priors)
-            else:
+            if graph.pose_graph == "se3":
                 optimise_frames(self.state, self._solver)
+                return
+            priors = pose_priors(self.state, self._tie, self.shots) if self._tie and graph.gps_priors else []
+            optimise_submaps(self.state, self._solver, priors)
 
     def _refine(self) -> None:
         with self.stopwatch.stage("refinement"):

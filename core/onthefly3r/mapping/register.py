@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
+from ..geometry.arrays import Float
 from ..geometry.transforms import Sim3
 from ..options import RegistrationOptions
 from ..records import (
@@ -23,13 +25,18 @@ from ..registration.align import align
 from ..registration.geometric import only, prune_references
 from ..registration.references import correspond
 from ..registration.validate import (
+    LEAST_MISFIT,
+    MISFIT_GATE,
     PoseResidual,
     ReferenceVerdict,
+    reference_misfit,
     reference_points_in_map,
     validate_query,
     validate_references,
 )
 from .state import MapState
+
+PositionCheck = Callable[[int, Float, Mapping[int, Float]], float]
 
 
 @dataclass(frozen=True)
@@ -50,8 +57,13 @@ def register(
     state: MapState,
     min_confidence: float,
     options: RegistrationOptions,
+    far_from_position: PositionCheck | None = None,
 ) -> Registration | Rejection:
-    """Register a local model to the map (Eq. 10-13 with geometric pruning); a misfit is a `Rejection`."""
+    """Register a local model to the map (Eq. 10-13 with geometric pruning); a misfit is a `Rejection`.
+
+    `far_from_position` tells how far a new image, by its centre in the map, is from where its position says, over
+    what is allowed, given the centres of the references.
+    """
     references = {i: state.reference(i) for i in subset.references if i in model.views}
     poses = {i: state.submap_pose_of(i) for i in references}
     map_from_cam = {i: state.map_from_cam(i) for i in references}
@@ -77,14 +89,24 @@ def register(
     ]
     accepted = list(placed)
     if options.validation and options.validate_queries:
-        map_points = reference_points_in_map({i: references[i] for i in kept}, {i: poses[i] for i in kept})
-        local_from_map = alignment.map_from_local.inverse()
+        good = {i: references[i] for i in kept}
+        map_points = reference_points_in_map(good, poses)
+        map_from_local = alignment.map_from_local
+        local_from_map = map_from_local.inverse()
+        centres = {i: map_from_cam[i].translation for i in kept}
+        usual = cache(lambda: reference_misfit(model, local_from_map, good, poses, min_confidence))
         for index in placed:
-            query = validate_query(index, model.views[index], local_from_map, map_points, min_confidence)
-            if not query.passed:
+            view = model.views[index]
+            query = validate_query(index, view, local_from_map, map_points, min_confidence, usual)
+            numbers = {"overlap_points": float(query.overlap), "agreeing_share": query.agreeing, "misfit": query.misfit}
+            reason = query.reason
+            if query.passed and far_from_position is not None:
+                offset = far_from_position(index, map_from_local.apply(view.local_from_cam.translation), centres)
+                reason = "lands far from its position" if offset > 1.0 else ""
+                numbers["position_offset"] = offset
+            if reason:
                 accepted.remove(index)
-                numbers = {"overlap_points": float(query.overlap), "agreeing_share": query.agreeing}
-                refused.append(Rejection((index,), "queries", query.reason, numbers))
+                refused.append(Rejection((index,), "queries", reason, numbers))
     if not accepted:
         first = refused[0]
         return Rejection(subset.new, first.stage, first.reason, first.numbers)
@@ -99,16 +121,33 @@ def register(
 
 
 def check_seed(views: Mapping[int, LocalView], min_confidence: float) -> dict[int, Rejection]:
-    """Return the views of a first model that contradict the rest: their depth against all other views' points."""
-    rejected = {}
+    """Return the views of a first model that contradict the rest, worst first.
+
+    Each is judged by its depth against the points of all views that still count; the worst one is taken out until
+    the others agree.
+    """
     samples = {i: _sample(view, min_confidence, seed=i) for i, view in views.items()}
-    for index, view in views.items():
-        others = [points for i, points in samples.items() if i != index]
-        points = np.vstack(others) if others else np.zeros((0, 3))
-        verdict = validate_query(index, view, Sim3(), points, min_confidence)
-        if not verdict.passed:
-            numbers = {"overlap_points": float(verdict.overlap), "agreeing_share": verdict.agreeing}
-            rejected[index] = Rejection((index,), "seed", verdict.reason, numbers)
+    rejected: dict[int, Rejection] = {}
+    while len(samples) > 1:
+        verdicts = [
+            validate_query(
+                index,
+                views[index],
+                Sim3(),
+                np.vstack([points for i, points in samples.items() if i != index]),
+                min_confidence,
+            )
+            for index in samples
+        ]
+        usual = float(np.median([verdict.misfit for verdict in verdicts]))
+        worst = max(verdicts, key=lambda verdict: (not verdict.passed, verdict.misfit))
+        too_far = worst.misfit > max(LEAST_MISFIT, MISFIT_GATE * usual)
+        if worst.passed and not too_far:
+            break
+        reason = worst.reason or "its depth disagrees with the other images more than theirs does"
+        numbers = {"overlap_points": float(worst.overlap), "agreeing_share": worst.agreeing, "misfit": worst.misfit}
+        rejected[worst.index] = Rejection((worst.index,), "seed", reason, numbers)
+        del samples[worst.index]
     return rejected
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,10 @@ from .references import MAX_PAIRS_PER_REFERENCE, spread_sample
 MIN_OVERLAP_POINTS = 15
 DEPTH_TOLERANCE = 0.06  # relative; terrain steps and occlusions exceed it, so only a share must agree
 MIN_AGREEING_SHARE = 0.5
+# The depth of a new image may miss the map by so many times what the references' own depth misses, and by as much as
+# a least amount that is no measure of anything.
+MISFIT_GATE = 5.0
+LEAST_MISFIT = 0.01
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,7 @@ class QueryVerdict:
     overlap: int  # map points that fall into the image where it has depth
     agreeing: float  # share of them whose depth agrees
     depth_bias: float  # median log ratio, map depth over predicted depth
+    misfit: float  # median size of that log ratio
     reason: str
 
     @property
@@ -128,18 +133,43 @@ def validate_query(
     local_from_map: Sim3,
     map_points: Float,
     min_confidence: float,
+    usual_misfit: Callable[[], float] | None = None,
 ) -> QueryVerdict:
-    """Compare the depth of map points (N, 3), seen from a new image, with the depth that it predicts itself."""
+    """Compare the depth of map points (N, 3), seen from a new image, with the depth that it predicts itself.
+
+    `usual_misfit` returns what views that are known to be right miss; it is asked only where that matters.
+    """
     cam_points = view.local_from_cam.inverse().apply(local_from_map.apply(map_points))
     predicted = _predicted_depth(view, cam_points, min_confidence)
     known = np.isfinite(predicted)
     overlap = int(known.sum())
     if overlap < MIN_OVERLAP_POINTS:
-        return QueryVerdict(index, overlap, 0.0, 0.0, "does not overlap the references")
+        return QueryVerdict(index, overlap, 0.0, 0.0, np.inf, "does not overlap the references")
     log_ratio = np.log(cam_points[known, 2] / predicted[known])
     agreeing = float((np.abs(log_ratio) <= DEPTH_TOLERANCE).mean())
-    reason = "" if agreeing >= MIN_AGREEING_SHARE else "its depth disagrees with the map"
-    return QueryVerdict(index, overlap, agreeing, float(np.median(log_ratio)), reason)
+    misfit = float(np.median(np.abs(log_ratio)))
+    reason = ""
+    if agreeing < MIN_AGREEING_SHARE:
+        reason = "its depth disagrees with the map"
+    elif usual_misfit is not None and misfit > LEAST_MISFIT and misfit > MISFIT_GATE * usual_misfit():
+        reason = "its depth disagrees with the map more than the references' does"
+    return QueryVerdict(index, overlap, agreeing, float(np.median(log_ratio)), misfit, reason)
+
+
+def reference_misfit(
+    model: LocalModel,
+    local_from_map: Sim3,
+    references: Mapping[int, CompactReference],
+    map_from_submap: Mapping[int, Sim3],
+    min_confidence: float,
+) -> float:
+    """Return the median misfit of the references' depth to each other's points; infinite when nothing overlaps."""
+    misfits = []
+    for index in references:
+        others = {i: reference for i, reference in references.items() if i != index}
+        points = reference_points_in_map(others, map_from_submap)
+        misfits.append(validate_query(index, model.views[index], local_from_map, points, min_confidence).misfit)
+    return float(np.median(misfits)) if misfits else np.inf
 
 
 def _predicted_depth(view: LocalView, cam_points: Float, min_confidence: float) -> Float:
