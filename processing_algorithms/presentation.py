@@ -46,12 +46,14 @@ class Presentation(QgsProcessingLayerPostProcessorInterface):
 
 
 def group_into(project: QgsProject, layer: QgsMapLayer, name: str) -> None:
-    """Move a layer of the project into a group, which is made where it is missing."""
+    """Move a layer of the project to its place in a group, which is made where it is missing."""
     root = project.layerTreeRoot()
     node = root.findLayer(layer.id())
-    if node is None or not name or (node.parent() and node.parent().name() == name):
+    if node is None or not name:
         return
     group = root.findGroup(name) or root.insertGroup(0, name)
+    # QGIS may have put it into the group already, for it adds layers beside the selected one. The copy comes first:
+    # a layer that is nowhere in the tree is removed from the project.
     group.insertChildNode(_place(layer, group), node.clone())
     node.parent().removeChildNode(node)
 

@@ -98,13 +98,14 @@ def test_enums_are_fully_qualified(archive: zipfile.ZipFile) -> None:
             assert not short.search(archive.read(name).decode("utf-8")), name
 
 
-def test_same_source_same_zip(plugin_zip: Path, tmp_path: Path) -> None:
+def test_same_source_same_zip(tmp_path: Path) -> None:
     from package_plugin import package
 
-    assert package(tmp_path / "again.zip").read_bytes() == plugin_zip.read_bytes()
+    assert package(tmp_path / "one.zip").read_bytes() == package(tmp_path / "two.zip").read_bytes()
 
 
-def test_verb_of_bootstrap(plugin_zip: Path) -> None:
+def test_verb_of_bootstrap(archive: zipfile.ZipFile) -> None:
     ran = subprocess.run([sys.executable, str(ROOT / "bootstrap.py"), "package"], capture_output=True, text=True)
     assert ran.returncode == 0
-    assert Path(ran.stdout.strip()).read_bytes() == plugin_zip.read_bytes()
+    with zipfile.ZipFile(ran.stdout.strip()) as made:
+        assert made.namelist() == archive.namelist()

@@ -144,6 +144,7 @@ def test_menu_opens_and_goes_away(qgis: Any, plugin: Any, run: dict[str, Any], m
                 self.toolbar.remove(action)
 
     monkeypatch.setattr(main.OnTheFly3RPlugin, "initProcessing", lambda self: None)
+    plugin("plugin.settings").save_last_report(run["REPORT"])
     interface = Interface()
     shown = main.OnTheFly3RPlugin(interface)
     shown.initGui()
