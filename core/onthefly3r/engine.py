@@ -205,7 +205,12 @@ class Engine:
             seed = choose_seed(self._waiting, self._index.similarities, wanted, frozenset(self._refused_seeds))
             if len(seed) < 3 or len(self._refused_seeds) > 3 * SEED_ATTEMPTS:
                 for index in self._waiting:
-                    self._reject((index,), "seed", "no group of images hangs together", {})
+                    self._reject(
+                        (index,),
+                        "seed",
+                        "no group of images hangs together",
+                        {"attempts": float(len(self._refused_seeds))},
+                    )
                 self._waiting = []
                 return False
             self._checkpoint("starting the map", 0, len(self.shots))
@@ -344,8 +349,9 @@ class Engine:
             threshold = self._backbone.spec.confidence_threshold
             points = self.options.registration.reference_points
             frames = [new_frame(i, submap.number, model.views[i], self._images[i], threshold, points) for i in accepted]
-            complete = replace(submap, frames=tuple(new.frame for new in frames))
-            self.state.commit(complete, frames, model.calibrations, model.observations)
+            placed_frames = tuple(new.frame for new in frames)
+            complete = replace(submap, frames=placed_frames, calibrations=model.calibrations)
+            self.state.commit(complete, frames, model.observations)
         placed = [new.frame.index for new in frames]
         for index in placed:
             self.rejections.pop(index, None)

@@ -248,6 +248,7 @@ class Submap:
     frames: tuple[Frame, ...]
     edges: tuple[Edge, ...]
     frame_edges: tuple[FrameEdge, ...] = ()
+    calibrations: Mapping[str, Camera] = field(default_factory=dict)  # first seen here; per camera key, photograph size
 
 
 @dataclass(frozen=True)

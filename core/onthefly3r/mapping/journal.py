@@ -72,6 +72,7 @@ def submap_to_json(submap: Submap) -> dict[str, Any]:
             {**asdict(edge), "source_from_target": rigid3_to_json(edge.source_from_target)}
             for edge in submap.frame_edges
         ],
+        "calibrations": {key: asdict(camera) for key, camera in submap.calibrations.items()},
     }
 
 
@@ -107,7 +108,9 @@ def submap_from_json(value: Any) -> Submap:
         )
         for e in value["frame_edges"]
     )
-    return Submap(int(value["number"]), sim3_from_json(value["map_from_submap"]), frames, edges, frame_edges)
+    calibrations = {str(key): camera_from_json(camera) for key, camera in value["calibrations"].items()}
+    pose = sim3_from_json(value["map_from_submap"])
+    return Submap(int(value["number"]), pose, frames, edges, frame_edges, calibrations)
 
 
 def shot_to_json(shot: Shot) -> dict[str, Any]:

@@ -39,7 +39,7 @@ class MapState:
         for kind, value in store.replay():
             try:
                 if kind == "submap":
-                    state._take(submap_from_json(value), {})
+                    state._take(submap_from_json(value))
                 elif kind == "spacing":
                     state.spacing = float(value)
                 elif kind == "submap_poses":
@@ -49,7 +49,7 @@ class MapState:
                     state.calibrations.update({k: camera_from_json(v) for k, v in value["calibrations"].items()})
                 elif kind == "frame_poses":
                     state._moved.update({int(k): rigid3_from_json(v) for k, v in value.items()})
-            except (KeyError, TypeError, ValueError) as error:
+            except (AttributeError, KeyError, TypeError, ValueError) as error:
                 raise InputError(f"the journal's entry {kind!r} is damaged ({error!r}); run again") from error
         return state
 
@@ -75,28 +75,22 @@ class MapState:
         """Return map_from_submap of the submap that predicted a frame, as refined for this frame if it was."""
         return self._refined.get(index) or self.map_from_submap[self.frames[index].submap]
 
-    def commit(
-        self,
-        submap: Submap,
-        frames: Sequence[NewFrame],
-        calibrations: Mapping[str, Camera],
-        observations: Observations | None = None,
-    ) -> None:
+    def commit(self, submap: Submap, frames: Sequence[NewFrame], observations: Observations | None = None) -> None:
         """Add one validated batch (Eq. 14); it is on disk before it counts."""
         self._store.commit(submap, frames, observations)
-        self._take(submap, calibrations)
+        self._take(submap)
 
     def set_spacing(self, spacing: float) -> None:
         """Set l_scene once the seed is known."""
         self.spacing = spacing
         self._store.note("spacing", spacing)
 
-    def _take(self, submap: Submap, calibrations: Mapping[str, Camera]) -> None:
+    def _take(self, submap: Submap) -> None:
         self.map_from_submap[submap.number] = submap.map_from_submap
         self.frames.update({frame.index: frame for frame in submap.frames})
         self.edges.extend(submap.edges)
         self.frame_edges.extend(submap.frame_edges)
-        for key, camera in calibrations.items():
+        for key, camera in submap.calibrations.items():
             self.calibrations.setdefault(key, camera)
 
     def move_submaps(self, map_from_submap: Mapping[int, Sim3]) -> None:

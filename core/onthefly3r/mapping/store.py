@@ -75,11 +75,16 @@ class Store:
             os.fsync(journal.fileno())
 
     def replay(self) -> Iterator[tuple[str, Any]]:
-        """Yield the journal's lines as (kind, JSON value), oldest first; raises `InputError` for a damaged one."""
+        """Yield the journal's lines as (kind, JSON value), oldest first; raises `InputError` for a damaged one.
+
+        A last line without its end was being written when the run was killed: it never counted.
+        """
         if not self._journal.exists():
             raise InputError(f"{self._journal} is missing: this folder holds no map; name the output folder of a run")
         with self._journal.open(encoding="utf-8") as journal:
             for number, line in enumerate(journal, start=1):
+                if not line.endswith("\n"):
+                    return
                 try:
                     ((kind, value),) = json.loads(line).items()
                 except (ValueError, AttributeError) as error:
