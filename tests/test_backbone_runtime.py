@@ -99,6 +99,16 @@ def test_out_of_memory_halves_the_new_images_and_is_remembered(weights: Path) ->
     assert backbone.batches == [11, 7, 5, 5]
 
 
+def test_out_of_memory_with_one_new_image_takes_fewer_references(weights: Path) -> None:
+    backbone = flat(weights, fitting=5)
+    for _ in range(2):
+        model = backbone.reconstruct(Subset(tuple(range(8)), (8, 9, 10)), images(11), {})
+        assert isinstance(model, LocalModel)
+        assert set(model.views) == {0, 1, 2, 3, 8}
+        assert model.left_out == (9, 10)
+    assert backbone.batches == [11, 9, 5, 5]
+
+
 def test_out_of_memory_with_one_new_image_is_a_rejection(weights: Path) -> None:
     outcome = flat(weights, fitting=3).reconstruct(Subset((0, 1, 2), (3, 4)), images(5), {})
     assert isinstance(outcome, Rejection)

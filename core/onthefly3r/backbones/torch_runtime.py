@@ -34,6 +34,8 @@ from .conventions import Canvas, NetworkImage, Prediction, compose, local_views,
 
 log = logging.getLogger("onthefly3r.backbones")
 
+MIN_REFERENCES = 3  # fewer do not tie a subset to the map
+
 
 @dataclass(frozen=True)
 class ModelCard:
@@ -115,27 +117,34 @@ class TorchBackbone(ABC):
     def reconstruct(
         self, subset: Subset, images: Mapping[int, WorkingImage], calibrations: Mapping[str, Camera]
     ) -> LocalModel | Rejection:
-        """Rebuild the subset; when GPU memory runs out, half of the new images are left out and it goes on."""
+        """Rebuild the subset; when GPU memory runs out, half of the new images, then of the references, are left out.
+
+        References come best first; `MIN_REFERENCES` of them and one new image stay, or the subset is rejected.
+        """
         started_s = time.perf_counter()
         least = 1 if subset.references else 2
-        new = subset.new
+        references, new = subset.references, subset.new
         if self._most_images is not None:
-            new = new[: max(least, self._most_images - len(subset.references))]
+            new = new[: max(least, self._most_images - len(references))]
+            references = references[: max(MIN_REFERENCES, self._most_images - len(new))]
         while True:
-            members = subset.references + new
+            members = references + new
             canvas = compose([self.prepare(images[index]) for index in members])
             prediction = self._run(canvas)
             if prediction is not None:
                 break
-            if len(new) <= least:
+            if len(new) > least:
+                new = new[: max(least, len(new) // 2)]
+            elif len(references) > MIN_REFERENCES:
+                references = references[: max(MIN_REFERENCES, len(references) // 2)]
+            else:
                 return Rejection(
                     subset.new,
                     "backbone",
                     "out of memory: not even one new image fits; give --max-gpu-memory-gib more, or --device cpu",
                     {"images": float(len(members)), "height_px": canvas.size[0], "width_px": canvas.size[1]},
                 )
-            new = new[: max(least, len(new) // 2)]
-            self._most_images = len(subset.references) + len(new)
+            self._most_images = len(references) + len(new)
             log.warning("%s: GPU memory ran out; going on with %d images", self.card.name, self._most_images)
         views = local_views(members, canvas, prediction)
         return LocalModel(
