@@ -1,0 +1,62 @@
+"""The embedded descriptor on places whose features are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from onthefly3r.records import Features, WorkingImage
+from onthefly3r.selection.descriptors import WORDS, VladDescriber
+
+
+def features(place: int, seed: int, count: int = 80) -> Features:
+    """The features of a place as one image sees them, a little noisy and in an order of its own."""
+    rng = np.random.default_rng(seed)
+    true = np.random.default_rng((1, place)).uniform(0.0, 255.0, (count, 128))
+    vectors = rng.permutation(np.repeat(true, 3, axis=0)) + 6.0 * rng.standard_normal((3 * count, 128))
+    n = len(vectors)
+    descriptors = np.clip(vectors, 0, 255).astype(np.uint8)
+    return Features(np.zeros((n, 2), np.float32), np.ones(n, np.float32), np.zeros(n, np.float32), descriptors)
+
+
+def describer(of: dict[int, Features]) -> VladDescriber:
+    return VladDescriber(lambda index, image: of[index])
+
+
+def images(of: dict[int, Features]) -> dict[int, WorkingImage]:
+    return dict.fromkeys(of)  # type: ignore[arg-type]  # the features are looked up by index
+
+
+@pytest.fixture(scope="module")
+def places() -> dict[int, Features]:
+    """Images 2k and 2k + 1 show the same place."""
+    return {i: features(i // 2, seed=i) for i in range(12)}
+
+
+def test_images_of_one_place_are_most_alike(places: dict[int, Features]) -> None:
+    describe = describer(places)
+    describe.fit(images(places))
+    vectors = np.stack([describe.describe(i, None) for i in places])  # type: ignore[arg-type]
+    assert vectors.dtype == np.float32 and vectors.shape == (12, WORDS * 128)
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, atol=1e-5)
+    similarity = vectors @ vectors.T - 2.0 * np.eye(12)
+    assert [int(s.argmax()) for s in similarity] == [i ^ 1 for i in range(12)]
+
+
+def test_the_codebook_is_the_same_each_time(places: dict[int, Features]) -> None:
+    twice = []
+    for _ in range(2):
+        describe = describer(places)
+        describe.fit(images(places))
+        twice.append(describe.describe(3, None))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(*twice)
+
+
+def test_images_without_texture_stop_nothing() -> None:
+    empty = {0: features(0, 0, count=0), 1: features(1, 1, count=4)}
+    describe = describer(empty)
+    with pytest.raises(RuntimeError, match="before fit"):
+        describe.describe(0, None)  # type: ignore[arg-type]
+    describe.fit(images(empty))
+    assert not describe.describe(0, None).any()  # type: ignore[arg-type]
+    assert np.linalg.norm(describe.describe(1, None)) == pytest.approx(1.0, abs=1e-5)  # type: ignore[arg-type]
