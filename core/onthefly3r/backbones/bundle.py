@@ -49,7 +49,7 @@ class NormalEquations:
     point: Int  # (M,)
 
     def eliminated(self, damping: float) -> tuple[Float, Any, Any]:
-        """Return the root R of pp^-1 = R R^T (N, 3, 3), cp R (D, 3N), and the damped system of C alone (D, D), sparse."""
+        """Return the root R of pp^-1 = R R^T (N, 3, 3), cp R (D, 3N) and the damped system of C (D, D), sparse."""
         from scipy import sparse
 
         trace = np.einsum("nii->n", self.pp)
@@ -61,7 +61,7 @@ class NormalEquations:
         starts = np.concatenate([[0], np.cumsum(np.bincount(self.image, minlength=n_images))])
         blocks = (self.pose_point @ root[self.point])[order], self.point[order], starts
         poses = sparse.bsr_matrix(blocks, shape=(6 * n_images, 3 * len(self.pp)))
-        shared = np.swapaxes(self.intrinsics_point @ root, 1, 2).reshape(n_shared, -1)
+        shared = np.swapaxes(self.intrinsics_point @ root, 1, 2).reshape(n_shared, 3 * len(self.pp))
         cp = sparse.vstack([poses.tocsr(), sparse.csr_matrix(shared)], format="csr")
         damped = self.cc + (damping + LEAST_DAMPING) * sparse.diags(self.cc.diagonal())
         return root, cp, (damped - cp @ cp.T).tocsc()

@@ -109,6 +109,15 @@ def _pipeline_options(threads: int) -> Any:
     options.min_model_size = MIN_MODEL_SIZE
     options.multiple_models = False
     options.extract_colors = False
+    # What follows does with fewer and looser adjustments: measured on subsets of real surveys, it halves the time,
+    # and no camera moves by more than its error.
+    options.ba_local_max_refinements = 1
+    options.ba_local_function_tolerance = 1e-3
+    options.mapper.ba_local_num_images = 4
+    options.ba_global_max_refinements = 1
+    options.ba_global_function_tolerance = 1e-4
+    options.ba_global_frames_ratio = 2.0
+    options.ba_global_points_ratio = 2.0
     options.mapper.abs_pose_refine_focal_length = False
     options.mapper.abs_pose_refine_extra_params = False
     return options

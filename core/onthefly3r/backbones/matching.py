@@ -19,6 +19,7 @@ CACHED_PAIRS = 4000
 DESCRIPTOR_NORM = 512.0  # pycolmap stores unit RootSIFT vectors times 512 as bytes
 MAX_RATIO = 0.8
 MAX_DISTANCE = 0.7
+MIN_TRIALS = 30  # of RANSAC; most pairs of a subset have so many inliers that these suffice
 
 
 class PairMatcher:
@@ -55,6 +56,8 @@ class PairMatcher:
 
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.random_seed = 0
+        options.ransac.min_num_trials = MIN_TRIALS
+        options.detect_watermark = False
         matches = mutual_matches(first, second)
         if len(matches) < options.min_num_inliers:
             return pycolmap.TwoViewGeometry()

@@ -47,7 +47,7 @@ def fuse(
     because images of one local model share its errors. Points that are not finite or have no confidence are left out.
 
     Args:
-        tiles_in: unfused points in the export frame, m; one record per image or batch, any order; `views` is not read.
+        tiles_in: unfused points in one frame in metres; one record per image or batch, any order; `views` is not read.
         spacing_m: side of the cubic voxels, m; the grid starts at the origin of the export frame.
         min_confidence: fused points below it are dropped, 0..1.
         work: folder for temporary files (40 bytes a point), removed from it at the end.
