@@ -68,6 +68,8 @@ class PairMatcher:
 
 def mutual_matches(first: Features, second: Features) -> Int:
     """Return index pairs (M, 2) of mutual nearest RootSIFT neighbours that pass Lowe's ratio test."""
+    if not len(first.descriptors) or not len(second.descriptors):
+        return np.zeros((0, 2), np.uint32)
     # One matrix product finds all distances: an order faster than building an index for a few thousand features.
     similarity = (first.descriptors.astype(np.float32) @ second.descriptors.astype(np.float32).T) / DESCRIPTOR_NORM**2
     best = similarity.argmax(axis=1)
