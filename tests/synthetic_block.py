@@ -13,7 +13,7 @@ from onthefly3r.geometry.camera import Camera
 from onthefly3r.geometry.transforms import Rigid3, rotation_exp
 from onthefly3r.records import Features, Shot
 
-CAMERA = Camera(1000, 750, 800.0, 800.0, 500.0, 375.0, (-0.02, 0.012, 0.001, -0.0005))
+CAMERA = Camera(1000, 750, 800.0, 800.0, 500.0, 375.0, (-0.008, 0.006, 0.0005, -0.0003))
 HEIGHT = 50.0
 KEY = "camera"
 

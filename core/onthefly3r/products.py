@@ -131,7 +131,7 @@ def _write_cloud(
         lambda done, total: checkpoint("fusing the cloud", done, total),
     )
     # Fused before it is projected: a fifth of the points are left then.
-    tiles = (replace(tile, points=frame.from_level(tile.points)) for tile in fused)
+    tiles: Iterator[CloudTile] = (replace(tile, points=frame.from_level(tile.points)) for tile in fused)
     if options.export.boundary is not None:
         tiles = clipped(tiles, _boundary(Path(options.export.boundary), reference))
     name = f"cloud.{options.export.format}"
