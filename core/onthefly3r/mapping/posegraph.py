@@ -63,28 +63,44 @@ def default_solver() -> PoseGraphSolver:
 def optimise_submaps(state: MapState, solver: PoseGraphSolver, priors: Sequence[PosePrior] = ()) -> float:
     """Move the submaps to agree with all edges and priors (Eq. 16 on Sim(3)); return the largest shift in spacings.
 
-    Once the map has settled, priors that stand out are dropped as wrong, and the edges' covariances grow to the
-    misfits that are left: local models that all bend alike contradict each other more than their points show. Then
-    it settles once more.
+    Priors that contradict their neighbours are left out. Once the map has settled, the edges' covariances grow to the
+    misfits that are left, and it settles once more: local models that all bend alike contradict each other more than
+    their points show.
     """
+    priors = consistent_priors(priors, state.edges)
     if not priors and not has_loops(len(state.map_from_submap), state.edges):
         return 0.0
     before = {index: state.map_from_cam(index).translation for index in state.frames}
     solved = solver.solve_sim3(state.map_from_submap, state.edges, priors, fixed=0)
     if priors:
-        good = agreeing_priors(solved, priors)
-        solved = solver.solve_sim3(solved, honest_edges(solved, state.edges), good, fixed=0)
+        solved = solver.solve_sim3(solved, honest_edges(solved, state.edges), priors, fixed=0)
     state.move_submaps(solved)
     shift = max(float(np.abs(state.map_from_cam(i).translation - before[i]).max()) for i in before)
     return shift / state.spacing
 
 
-def agreeing_priors(nodes: Mapping[int, Sim3], priors: Sequence[PosePrior]) -> list[PosePrior]:
-    """Return the priors whose misfit is not far beyond the usual one (and beyond their own uncertainty)."""
-    steps = [tangent(p.map_from_submap.inverse() @ nodes[p.submap]) for p in priors]
-    misfit = [float(step @ p.information @ step) for step, p in zip(steps, priors, strict=True)]
-    limit = OUTLYING_PRIOR * max(float(np.median(misfit)), MEDIAN_MISFIT)
-    return [prior for prior, value in zip(priors, misfit, strict=True) if value <= limit]
+def consistent_priors(priors: Sequence[PosePrior], edges: Sequence[Edge]) -> list[PosePrior]:
+    """Return the priors that most of their submaps' edges lead to from the priors at the other end.
+
+    A map that has bent as a whole misfits all of them alike; a wrong one stands out.
+    """
+    prior_of = {prior.submap: prior for prior in priors}
+    misfits: dict[int, list[float]] = {submap: [] for submap in prior_of}
+    for edge in edges:
+        if edge.source in prior_of and edge.target in prior_of:
+            source, target = prior_of[edge.source], prior_of[edge.target]
+            step = tangent(
+                edge.source_from_target.inverse() @ (source.map_from_submap.inverse() @ target.map_from_submap)
+            )
+            # As if both ends were known like the target: what it leaves open tells nothing.
+            covariance = edge.covariance + 2.0 * np.linalg.inv(floored(target.information))
+            misfit = float(step @ np.linalg.solve(floored(covariance), step))
+            misfits[edge.source].append(misfit)
+            misfits[edge.target].append(misfit)
+    # The lower median: of two neighbours one that agrees is enough.
+    usual = {submap: sorted(values)[(len(values) - 1) // 2] for submap, values in misfits.items() if values}
+    limit = OUTLYING_PRIOR * max(float(np.median(list(usual.values()))) if usual else 0.0, MEDIAN_MISFIT)
+    return [prior for prior in priors if usual.get(prior.submap, 0.0) <= limit]
 
 
 def honest_edges(nodes: Mapping[int, Sim3], edges: Sequence[Edge]) -> list[Edge]:
