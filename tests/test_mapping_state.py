@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from synthetic_models import true_references, true_view
 
 from onthefly3r.errors import InputError
 from onthefly3r.geometry.camera import Camera
@@ -29,6 +28,7 @@ from onthefly3r.mapping.journal import (
 from onthefly3r.mapping.state import MapState
 from onthefly3r.mapping.store import Store
 from onthefly3r.records import Attitude, Edge, FrameEdge, GpsFix, NewFrame, Shot, Submap, WorkingImage
+from synthetic_models import true_references, true_view
 
 LENS = Camera(4000, 3000, 2801.5, 2799.25, 2010.0, 1490.0, (-0.08, 0.02, 4e-4, -3e-4))
 
