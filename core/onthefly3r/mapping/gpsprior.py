@@ -56,13 +56,16 @@ def tie_to_positions(state: MapState, shots: Mapping[int, Shot], options: Georef
     if len(used) < max(MIN_POSITIONS, MIN_USED_SHARE * len(sample.images)):
         return None
     lengthwise, sideways, _ = np.linalg.svd(used - used.mean(axis=0), compute_uv=False) / np.sqrt(len(used))
-    if sideways < max(MIN_SIDEWAYS * lengthwise, MIN_EXTENT * float(np.median(sample.sigma_h_m))):
+    if sideways < MIN_SIDEWAYS * lengthwise:
         return None
     centres = np.array([state.map_from_cam(i).translation for i in positions.images])
     residuals = positions.enu - solution.enu_from_map.apply(centres)
     steps = np.abs(np.diff(residuals[positions.order], axis=0)) / np.sqrt(2.0)
     scatter = 1.4826 * np.median(steps, axis=0)
-    return GpsTie(solution.enu_from_map, positions, np.array([scatter[:2].max(), scatter[2]]))
+    noise_m = np.array([scatter[:2].max(), scatter[2]])
+    if sideways < MIN_EXTENT * max(noise_m[0], float(np.median(sample.sigma_h_m))):
+        return None
+    return GpsTie(solution.enu_from_map, positions, noise_m)
 
 
 def pose_priors(state: MapState, tie: GpsTie, shots: Mapping[int, Shot]) -> list[PosePrior]:
