@@ -117,7 +117,7 @@ class Pictures:
         QTimer.singleShot(after_ms, then)
 
     def toolbox(self) -> None:
-        """The window with the toolbox, the provider's group open."""
+        """The toolbox with the provider's group open."""
         from qgis.PyQt.QtWidgets import QDockWidget, QTreeView
         from qgis.utils import iface
 
@@ -125,13 +125,16 @@ class Pictures:
         window.resize(1200, 760)
         for dock in window.findChildren(QDockWidget):
             dock.setVisible(dock.objectName() in ("ProcessingToolbox", "Layers"))
-        tree = window.findChild(QDockWidget, "ProcessingToolbox").findChild(QTreeView)
-        model = tree.model()
-        for row in range(model.rowCount()):
-            tree.setExpanded(model.index(row, 0), "On-the-Fly3R" in str(model.index(row, 0).data()))
-        tree.scrollToBottom()
         iface.newProject()
-        self._later(SETTLE_MS // 2, lambda: self._save(window, "qgis-toolbox.png"))
+        toolbox = window.findChild(QDockWidget, "ProcessingToolbox")
+        tree = toolbox.findChild(QTreeView)
+        tree.collapseAll()
+        for row in range(tree.model().rowCount()):
+            index = tree.model().index(row, 0)
+            if "On-the-Fly3R" in str(index.data()):
+                tree.expand(index)
+        tree.scrollToBottom()
+        self._later(SETTLE_MS // 2, lambda: self._save(toolbox, "qgis-toolbox.png"))
 
     def dialog(self) -> None:
         """The dialog of the main algorithm."""
@@ -184,7 +187,8 @@ class Pictures:
         from qgis.PyQt.QtWebKitWidgets import QWebView
 
         self._page = QWebView()
-        self._page.resize(1000, 1250)
+        self._page.resize(760, 1180)
+        self._page.setZoomFactor(0.75)
         self._page.load(QUrl.fromLocalFile(str(self.work / "quarry" / "report.html")))
         self._page.show()
         self._later(SETTLE_MS // 2, lambda: self._save(self._page, "qgis-report.png"))

@@ -30,7 +30,7 @@ def colours(path: Path) -> set[int]:
     from qgis.PyQt.QtGui import QImage
 
     picture = QImage(str(path))
-    assert picture.width() >= 1000
+    assert picture.width() >= 200 and picture.height() >= 400
     return {picture.pixel(x, y) for x in range(0, picture.width(), 2) for y in range(0, picture.height(), 2)}
 
 
