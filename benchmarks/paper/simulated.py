@@ -50,6 +50,7 @@ SCENARIOS = {
         Scenario("HAV-in-order", 424, 14, 1, False, NOISE, FAULTS),
         Scenario("HAV", 424, 14, 2, False, NOISE, FAULTS),
         Scenario("Residence", 2582, 33, 2, True, NOISE, FAULTS),
+        Scenario("Residence-plain", 2582, 33, 2, False, NOISE, FAULTS),
         Scenario("Campus", 5871, 50, 3, True, NOISE, FAULTS),
     )
 }
