@@ -21,6 +21,7 @@ from qgis.core import (
 from .base import ROOT, tr
 
 STYLES = ROOT / "resources" / "styles"
+HEIGHT, POINTS = {"cloud": 0, "footprints.qml": 1}, 2  # layers with the greater figure lie above the others
 
 
 class Presentation(QgsProcessingLayerPostProcessorInterface):
@@ -76,7 +77,14 @@ def _colour_cloud(layer: QgsMapLayer) -> None:
 def show(context: QgsProcessingContext, destination: str, group: str, style: str) -> None:
     """Give a layer that will be loaded its style and group."""
     if context.willLoadLayerOnCompletion(destination):
-        context.layerToLoadOnCompletionDetails(destination).setPostProcessor(Presentation(group, style))
+        _present(context.layerToLoadOnCompletionDetails(destination), group, style)
+
+
+def _present(details: QgsProcessingContext.LayerDetails, group: str, style: str) -> None:
+    details.setPostProcessor(Presentation(group, style))
+    if hasattr(details, "groupName"):  # from 3.32 on QGIS groups and orders itself, after the post-processing
+        details.groupName = group
+        details.layerSortKey = HEIGHT.get(style, POINTS)
 
 
 def load_cloud(context: QgsProcessingContext, feedback: QgsProcessingFeedback, path: str, group: str) -> None:
@@ -90,8 +98,8 @@ def load_cloud(context: QgsProcessingContext, feedback: QgsProcessingFeedback, p
     details = QgsProcessingContext.LayerDetails(
         tr("Point cloud"), project, "CLOUD", QgsProcessingUtils.LayerHint.PointCloud
     )
-    details.setPostProcessor(Presentation(group, "cloud"))
     details.forceName = True
+    _present(details, group, "cloud")
     context.addLayerToLoadOnCompletion(path, details)
 
 

@@ -98,6 +98,32 @@ def test_cloud_is_loaded_where_qgis_can_read_it(
     assert QgsProviderRegistry.instance() is not None
 
 
+def test_newer_qgis_groups_and_orders_itself(plugin: Any) -> None:
+    class Details:
+        def __init__(self) -> None:
+            self.groupName, self.layerSortKey, self.kept = "", 0, None
+
+        def setPostProcessor(self, processor: Any) -> None:
+            self.kept = processor
+
+    class Context:
+        def __init__(self) -> None:
+            self.details = {name: Details() for name in ("cameras", "footprints")}
+
+        def willLoadLayerOnCompletion(self, name: str) -> bool:
+            return name in self.details
+
+        def layerToLoadOnCompletionDetails(self, name: str) -> Details:
+            return self.details[name]
+
+    context = Context()
+    for name in ("cameras", "footprints", "not loaded"):
+        plugin("processing_algorithms.presentation").show(context, name, "run", f"{name}.qml")
+    assert {details.groupName for details in context.details.values()} == {"run"}
+    assert context.details["cameras"].layerSortKey > context.details["footprints"].layerSortKey
+    assert all(details.kept is not None for details in context.details.values())
+
+
 def test_stale_index_is_removed(plugin: Any, tmp_path: Path) -> None:
     (tmp_path / "cloud.copc.laz").write_text("")
     (tmp_path / "ept_cloud").mkdir()
