@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from onthefly3r.evaluate.poses import PoseSet
 from onthefly3r.evaluate.trajectory import pose_errors
 
 from .published import ABLATION
@@ -21,22 +25,24 @@ CASES = {(OURS if number == 5 else f"case-{number}"): case for number, case in A
 def strategies_table(rows: Sequence[dict[str, Any]], out: Path, scenario: str) -> str:
     """Return one line for each strategy that was run on a survey.
 
-    "common" is the ATE on the frames that ours placed; "passes" is the worst ratio of the ATE after a pass of the pose
-    graph to the one before it, over all passes of all seeds.
+    "Median" is that of the position errors, which a few bad views do not move; "common" is the ATE on the frames that
+    ours placed; "passes" is the worst ratio of the ATE after a pass of the pose graph to the one before it, over all
+    passes of all seeds.
     """
     lines = []
     for strategy in STRATEGIES:
         runs = [r for r in rows if r["scenario"] == scenario and r["strategy"] == strategy]
         if not runs or strategy.startswith("case-"):
             continue
-        common = [_common_ate(out, scenario, strategy, r["seed"]) for r in runs]
+        poses = [_poses(out, scenario, strategy, r["seed"]) for r in runs]
         ratios = [after / before for r in runs for before, after in r["passes"] if before > 0.0]
         lines.append(
             [
                 strategy,
                 ", ".join(str(r["seed"]) for r in runs),
                 spread([r["ate"] for r in runs], runs[0]["note"]),
-                spread(common),
+                spread([_median_error(scenario, r["seed"], p) for r, p in zip(runs, poses, strict=True)]),
+                spread([_common_ate(out, scenario, r["seed"], p) for r, p in zip(runs, poses, strict=True)]),
                 *(spread([r[key] for r in runs]) for key in ("are_deg", "rte_deg", "rre_deg")),
                 f"{100.0 * sum(r['placed'] for r in runs) / sum(r['given'] for r in runs):.2f}",
                 f"{sum(r['calls'] for r in runs) / len(runs):.0f}",
@@ -45,7 +51,7 @@ def strategies_table(rows: Sequence[dict[str, Any]], out: Path, scenario: str) -
                 f"{max(ratios):.3f} ({len(ratios)})" if ratios else "-",
             ]
         )
-    head = ["Strategy", "Seeds", "ATE m", "common", "ARE deg", "RTE deg", "RRE deg", "Coverage %"]
+    head = ["Strategy", "Seeds", "ATE m", "Median m", "Common m", "ARE deg", "RTE deg", "RRE deg", "Coverage %"]
     return markdown([*head, "Calls", "Inferred / image", "Largest call", "Passes: worst ratio"], lines)
 
 
@@ -81,9 +87,22 @@ def spread(values: Sequence[float | None], otherwise: str = "") -> str:
     return shown(middle) if len(known) == 1 else f"{shown(middle)} [{shown(min(known))}, {shown(max(known))}]"
 
 
-def _common_ate(out: Path, scenario: str, strategy: str, seed: int) -> float | None:
-    paths = [pose_file(out, scenario, name, seed) for name in (strategy, OURS)]
-    if not all(path.is_file() for path in paths):
+def _median_error(scenario: str, seed: int, poses: PoseSet | None) -> float | None:
+    if poses is None:
         return None
-    estimate, ours = (read_result(path) for path in paths)
-    return pose_errors(estimate, truth(survey_of(SCENARIOS[scenario], seed)), only=[ours]).ate
+    return float(np.median([error for _, error, _ in pose_errors(poses, _truth(scenario, seed)).per_image]))
+
+
+def _common_ate(out: Path, scenario: str, seed: int, poses: PoseSet | None) -> float | None:
+    ours = _poses(out, scenario, OURS, seed)
+    return pose_errors(poses, _truth(scenario, seed), only=[ours]).ate if poses and ours else None
+
+
+def _poses(out: Path, scenario: str, strategy: str, seed: int) -> PoseSet | None:
+    path = pose_file(out, scenario, strategy, seed)
+    return read_result(path) if path.is_file() else None
+
+
+@lru_cache(maxsize=8)
+def _truth(scenario: str, seed: int) -> PoseSet:
+    return truth(survey_of(SCENARIOS[scenario], seed))
