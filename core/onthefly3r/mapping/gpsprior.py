@@ -28,6 +28,7 @@ MIN_SIDEWAYS = 0.1  # sideways over lengthwise extent: along one line positions 
 MIN_EXTENT = 5.0  # sideways, in sigmas of the positions: nearer together they say nothing of the map's shape
 HUBER = 1.345
 PRIOR_STEPS = 8
+SETTLED = 1e-6
 MAX_STEP = 0.2  # rad, or of the logarithm of scale, at a time: positions of one place tell nothing of either
 MIN_EIGENVALUE = 1e-4  # of the largest: directions of a submap that its positions do not determine
 VOTE_SIGMAS = 5.0
@@ -173,5 +174,7 @@ def _prior(submap: int, pose: Sim3, points: Float, targets: Float, root: Float) 
         step = step * min(1.0, MAX_STEP / max(float(np.abs(step[[0, 1, 2, 6]]).max()), 1e-12))
         step = np.linalg.solve(from_origin, step)
         pose = pose @ Sim3(float(np.exp(step[6])), rotation_exp(step[:3]), step[3:6])
+        if np.abs(step).max() < SETTLED:
+            break
     information = from_origin.T @ ((vectors * values) @ vectors.T) @ from_origin
     return PosePrior(submap, pose, np.asarray(information))

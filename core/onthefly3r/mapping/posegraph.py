@@ -85,6 +85,7 @@ def consistent_priors(priors: Sequence[PosePrior], edges: Sequence[Edge]) -> lis
     A map that has bent as a whole misfits all of them alike; a wrong one stands out.
     """
     prior_of = {prior.submap: prior for prior in priors}
+    covariance_of = {prior.submap: np.linalg.inv(floored(prior.information)) for prior in priors}
     misfits: dict[int, list[float]] = {submap: [] for submap in prior_of}
     for edge in edges:
         if edge.source in prior_of and edge.target in prior_of:
@@ -93,7 +94,7 @@ def consistent_priors(priors: Sequence[PosePrior], edges: Sequence[Edge]) -> lis
                 edge.source_from_target.inverse() @ (source.map_from_submap.inverse() @ target.map_from_submap)
             )
             # As if both ends were known like the target: what it leaves open tells nothing.
-            covariance = edge.covariance + 2.0 * np.linalg.inv(floored(target.information))
+            covariance = edge.covariance + 2.0 * covariance_of[edge.target]
             misfit = float(step @ np.linalg.solve(floored(covariance), step))
             misfits[edge.source].append(misfit)
             misfits[edge.target].append(misfit)
