@@ -9,7 +9,7 @@ from onthefly3r.records import Subset
 from onthefly3r.selection.frontier import Frontier, orphans
 from onthefly3r.selection.index import RetrievalIndex
 
-ANGLE_DEG = 10.0  # between neighbours on a line: similarity 0.985, 0.940, 0.866, 0.766, 0.643 ...
+ANGLE_DEG = 3.0  # between neighbours on a line; the twelve nearest are six on each side
 
 
 def line(count: int, index: RetrievalIndex | None = None) -> RetrievalIndex:
@@ -28,28 +28,28 @@ def frontier_of(index: RetrievalIndex, count: int) -> Frontier:
 
 
 def test_images_next_to_the_references_are_supported_and_far_ones_are_not() -> None:
-    index = line(9)
-    supported = frontier_of(index, 9).support([4, 5, 6, 7, 8], [0, 1, 2, 3], index)
-    assert [image for image in (4, 5, 6, 7, 8) if supported([image], [0, 1, 2, 3])] == [4, 5]
-    assert not supported([4], [0])
+    index = line(30)
+    supported = frontier_of(index, 30).support(range(4, 12), [0, 1, 2, 3], index)
+    assert [image for image in range(4, 12) if supported([image], [0, 1, 2, 3])] == [4, 5, 6, 7]
+    assert not supported([4], [0, 1])
 
 
 def test_images_hang_on_those_before_them_in_the_batch() -> None:
-    index = line(9)
-    supported = frontier_of(index, 9).support([4, 5, 6, 7, 8], [0, 1, 2, 3], index)
-    assert supported([4, 5, 6, 7], [0, 1, 2, 3])
-    assert not supported([7, 6, 5, 4], [0, 1, 2, 3])  # the first hangs on the references alone
-    assert not supported([4, 8], [0, 1, 2, 3])
+    index = line(30)
+    supported = frontier_of(index, 30).support(range(4, 12), [0, 1, 2, 3], index)
+    assert supported([4, 5, 6, 7, 8, 9], [0, 1, 2, 3])
+    assert not supported([8, 7, 6, 5], [0, 1, 2, 3])  # the first hangs on the references alone
+    assert not supported([4, 9], [0, 1, 2, 3])
 
 
-@pytest.mark.parametrize("step", [1, 4, 9])
+@pytest.mark.parametrize("step", [1, 7, 30])
 def test_images_that_arrive_one_by_one_are_judged_like_all_at_once(step: int) -> None:
-    index = line(9)
+    index = line(30)
     frontier = Frontier()
-    for start in range(0, 9, step):
-        frontier.add(list(range(start, min(start + step, 9))), index)
-    supported = frontier.support([4, 5, 6, 7, 8], [0, 1, 2, 3], index)
-    assert [image for image in (4, 5, 6, 7, 8) if supported([image], [0, 1, 2, 3])] == [4, 5]
+    for start in range(0, 30, step):
+        frontier.add(list(range(start, min(start + step, 30))), index)
+    supported = frontier.support(range(4, 12), [0, 1, 2, 3], index)
+    assert [image for image in range(4, 12) if supported([image], [0, 1, 2, 3])] == [4, 5, 6, 7]
 
 
 def test_a_far_image_is_supported_where_nothing_is_nearer() -> None:

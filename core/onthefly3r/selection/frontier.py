@@ -1,8 +1,8 @@
 """Which images may join a subset: those whose nearest neighbours are in it.
 
 Retrieval always finds k frames, however far away. An image that is reconstructed together with frames that do not see
-its ground may be put anywhere, and on even ground nothing betrays it. So an image waits while images that are much
-more similar to it than what the subset holds are still to be placed.
+its ground may be put anywhere, and on even ground nothing betrays it. So an image waits until some of
+its near neighbours among all images are in the subset.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from ..geometry.arrays import Float
 from ..records import Subset
 from .index import RetrievalIndex
 
-NEIGHBOURS = 3  # similarities of so many are averaged: fewer references are not enough to register an image
-READY = 0.8  # similarity to the subset over similarity to everything seen, from which an image is ready
+NEAREST = 12  # so many images seen so far are an image's near neighbours: ranks mean the same for any descriptor
+NEIGHBOURS = 3  # of them must be in the subset: fewer references are not enough to register an image
 BLOCK = 1000  # rows of similarities at a time
 
 
@@ -25,13 +25,13 @@ class Frontier:
 
     def __init__(self) -> None:
         self._row_of: dict[int, int] = {}
-        self._to_all: Float = np.zeros((0, NEIGHBOURS), np.float32)  # in no order
+        self._to_all: Float = np.zeros((0, NEAREST), np.float32)  # in no order
 
     def add(self, new: Sequence[int], retrieval: RetrievalIndex) -> None:
         """Take described images; `retrieval` knows them already."""
         before = list(self._row_of)
         self._row_of.update({index: len(before) + k for k, index in enumerate(new)})
-        empty = np.zeros((len(new), NEIGHBOURS), np.float32)
+        empty = np.zeros((len(new), NEAREST), np.float32)
         self._to_all = np.vstack([self._to_all, empty])
         known = list(self._row_of)
         for start in range(0, len(new), BLOCK):
@@ -39,7 +39,7 @@ class Frontier:
             similarity = np.array(retrieval.similarities(block, known))
             rows = [self._row_of[index] for index in block]
             similarity[np.arange(len(block)), rows] = 0.0  # nothing is its own neighbour
-            self._to_all[rows] = _highest(similarity)
+            self._to_all[rows] = _highest(similarity, NEAREST)
             if before:
                 self._to_all[: len(before)] = _merged(self._to_all[: len(before)], similarity[:, : len(before)].T)
 
@@ -55,12 +55,12 @@ class Frontier:
         to_images = retrieval.similarities(images, images)
         row = {index: i for i, index in enumerate(images)}
         column = {index: i for i, index in enumerate(references)}
-        least = READY * self._to_all[[self._row_of[index] for index in images]].mean(axis=1)
+        least = self._to_all[[self._row_of[index] for index in images]].min(axis=1)
 
         def supported(batch: Sequence[int], kept: Sequence[int]) -> bool:
             rows, columns = [row[index] for index in batch], [column[index] for index in kept]
             joined = np.hstack([to_references[np.ix_(rows, columns)], np.tril(to_images[np.ix_(rows, rows)], -1)])
-            return bool((_highest(joined).mean(axis=1) >= least[rows]).all())
+            return bool((_highest(joined, NEIGHBOURS).min(axis=1) >= least[rows]).all())
 
         return supported
 
@@ -78,10 +78,10 @@ def orphans(subset: Subset, kept: Sequence[int], retrieval: RetrievalIndex, min_
 
 
 def _merged(kept: Float, offered: Float) -> Float:
-    return _highest(np.hstack([kept, offered]))
+    return _highest(np.hstack([kept, offered]), NEAREST)
 
 
-def _highest(similarity: Float) -> Float:
-    """Return the highest similarities (N, NEIGHBOURS) of each row (N, M), zero where there are too few."""
-    padded = np.hstack([similarity, np.zeros((len(similarity), NEIGHBOURS), np.float32)])
-    return np.asarray(np.partition(padded, -NEIGHBOURS, axis=1)[:, -NEIGHBOURS:], np.float32)
+def _highest(similarity: Float, count: int) -> Float:
+    """Return the highest similarities (N, count) of each row (N, M), zero where there are too few."""
+    padded = np.hstack([similarity, np.zeros((len(similarity), count), np.float32)])
+    return np.asarray(np.partition(padded, -count, axis=1)[:, -count:], np.float32)
