@@ -67,8 +67,8 @@ class CheckPhotographs(CoreAlgorithm):
         "photographs, so that it can be run in the field, while the flight can still be repeated.\n\nThe layer of "
         "photographs has the verdict good, doubtful (it is used, but may be rejected) or unusable (it cannot be "
         "read), and the problems in words. Overlap follows from positions, angles and flying height on level ground; "
-        "where the drone does not state its height above the ground, name it. Time and memory of a run are estimated "
-        "for this computer and the quality that is chosen, within a factor of two."
+        "where the drone does not state its height above ground, it is measured between photographs. Time and memory "
+        "of a run are estimated for this computer and the quality that is chosen, within a factor of two."
     )
 
     def initAlgorithm(self, config: dict[str, Any] | None = None) -> None:
@@ -80,7 +80,11 @@ class CheckPhotographs(CoreAlgorithm):
         )
         number.setMinimum(0.1)
         number.setDefaultValue(None)
-        add(self, number, tr("Flying height. Empty: what the drone states above its take-off, where it does."))
+        add(
+            self,
+            number,
+            tr("Flying height. Empty: what the drone states above its take-off, else measured between photographs."),
+        )
         add_georeference(self)
         point, polygon = QgsProcessing.SourceType.TypeVectorPoint, QgsProcessing.SourceType.TypeVectorPolygon
         add(

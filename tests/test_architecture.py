@@ -31,7 +31,7 @@ LAYERS = (
     {"mapping"},
     {"export"},
     {"simulate"},
-    {"engine", "products"},
+    {"engine", "products", "flying_height", "estimate"},
     {"run", "check"},
     {"batch"},
     {"demo", "doctor", "viewer"},

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from onthefly3r import check
+from onthefly3r import estimate
 from onthefly3r.check import CheckedPhotograph, check_photographs, write_check
 from onthefly3r.errors import Cancelled, InputError
 from onthefly3r.options import Options
@@ -123,6 +123,29 @@ def test_named_height_goes_before_the_tags_and_sets_the_ground(survey: Path) -> 
     assert high["median_best_overlap"] > 0.85
 
 
+def without_flying_height(photos: Path) -> None:
+    for path in photos.iterdir():
+        path.write_bytes(path.read_bytes().replace(b"RelativeAltitude", b"NothingOfMeaning"))
+
+
+def test_flying_height_is_measured_where_the_tags_have_none(photos: Path) -> None:
+    without_flying_height(photos)
+    summary = check_photographs(photos).summary()
+    assert summary["above_ground_m"] == pytest.approx(80.0, rel=0.1)
+    assert summary["median_best_overlap"] == pytest.approx(0.8, abs=0.08)
+    assert any("measured between photographs" in warning for warning in summary["warnings"])
+
+
+def test_flying_height_stays_unknown_where_photographs_share_nothing(photos: Path) -> None:
+    without_flying_height(photos)
+    for seed, path in enumerate(sorted(photos.iterdir())):
+        noise = np.random.default_rng(seed).integers(0, 255, (480, 640, 3), np.uint8)
+        change(path, lambda image, noise=noise: Image.fromarray(noise))
+    checked = check_photographs(photos)
+    assert checked.summary()["above_ground_m"] is None
+    assert any("name the height above ground" in warning for warning in checked.warnings)
+
+
 def test_without_any_position(photos: Path) -> None:
     for path in photos.iterdir():
         without_tags(path)
@@ -144,7 +167,7 @@ def test_options_of_the_planned_run_count(survey: Path) -> None:
 
 def test_time_follows_from_features_and_sizes(survey: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clock = itertools.count(step=3)  # three seconds for the three photographs that are timed
-    monkeypatch.setattr(check.time, "perf_counter", lambda: float(next(clock)))
+    monkeypatch.setattr(estimate.time, "perf_counter", lambda: float(next(clock)))
     standard = check_photographs(survey, Options.from_flat({"threads": 1}))
     assert standard.time_s == pytest.approx(12 * (1.0 + 2.5 + 10.0 * 0.25))
     two_cores = check_photographs(survey, Options.from_flat({"threads": 2, "dense_px": 250}))

@@ -9,7 +9,6 @@ import csv
 import io
 import json
 import os
-import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -19,11 +18,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .backbones.features import extract_features, new_extractor
 from .errors import Cancelled, PhotographError
+from .estimate import estimated_memory_mib, estimated_time_s
 from .export.atomic import write_text
 from .export.clip import in_ring
 from .export.footprints import Footprint, footprint, with_overlap
+from .flying_height import measured_height_m
 from .geometry.arrays import Float
 from .geometry.camera import Camera
 from .geometry.frames import enu_from_cam_rotation
@@ -47,12 +47,6 @@ LEAST_CONTRAST = 6.0
 LEAST_OVERLAP = 0.5  # with the neighbour that shows most of the same ground
 LEAST_COVERED = 0.6  # of the ground in three photographs: below it the map falls apart
 SAMPLES = 12  # per side of a footprint
-
-# One photograph takes about so many times as long as finding its features, and half of it is dense at 500 of 1000 px;
-# memory as measured on surveys of 18 to 170 photographs. Other surveys differ by a factor of two.
-SPARSE_FACTOR, DENSE_FACTOR = 2.5, 10.0
-TIMED_PHOTOGRAPHS = 3
-BASE_MIB, IMAGES_MIB, MOST_IMAGES_MIB = 350.0, 9.0, 700.0  # at 1000 px; only the last images stay in memory
 
 
 @dataclass(frozen=True)
@@ -129,7 +123,8 @@ def check_photographs(
     Args:
         photos: the folder, as for a run.
         options: of the run that is planned; time, memory and sharpness are judged for them.
-        above_ground_m: flying height; replaces what the drone states above its take-off.
+        above_ground_m: flying height; replaces what the drone states above its take-off. Where neither is known, it
+            is measured between photographs.
         progress: told after every photograph.
         cancel: asked before every photograph; true raises `Cancelled`.
 
@@ -143,6 +138,10 @@ def check_photographs(
     positions = usable_positions(range(len(shots)), dict(enumerate(shots)), options.georeference)
     crs, world = _projected(positions, options)
     heights = {i: above_ground_m or shot.above_takeoff_m for i, shot in enumerate(shots)}
+    measured_m = None
+    if not any(heights.values()):
+        measured_m = measured_height_m(shots, world)
+        heights = dict.fromkeys(heights, measured_m)
     grounds = _footprints(shots, world, heights)
     rows = [_row(i, shot, measured[i], positions, world, heights, grounds) for i, shot in enumerate(shots)]
     rows = _judged(rows, shots)
@@ -152,9 +151,9 @@ def check_photographs(
         photographs=tuple(rows),
         crs=crs,
         vertical=positions.vertical,
-        warnings=(*positions.warnings, *_flight_warnings(rows, shots, refused, positions)),
-        time_s=_estimated_time_s(usable, options),
-        memory_mib=_estimated_memory_mib(len(usable), options),
+        warnings=(*positions.warnings, *_flight_warnings(rows, shots, refused, positions, measured_m)),
+        time_s=estimated_time_s(usable, options),
+        memory_mib=estimated_memory_mib(len(usable), options),
     )
 
 
@@ -338,6 +337,7 @@ def _flight_warnings(
     shots: Sequence[Shot],
     refused: Sequence[RefusedPhotograph],
     positions: Positions,
+    measured_m: float | None,
 ) -> list[str]:
     warnings = []
     without = sum(shot.gps is None for shot in shots)
@@ -345,7 +345,9 @@ def _flight_warnings(
         warnings.append(f"{without} of {len(shots)} photographs have no position")
     if positions.distinct < 3:
         warnings.append("fewer than three different positions: the result cannot be georeferenced")
-    if shots and not any(row.footprint for row in rows):
+    if measured_m is not None:
+        warnings.append(f"no flying height in the tags: about {measured_m:.0f} m, measured between photographs")
+    elif shots and not any(row.footprint for row in rows):
         warnings.append("no flying height in the tags: overlap cannot be told; name the height above ground")
     covered = _mean([row.covered for row in rows])
     if covered is not None and covered < LEAST_COVERED:
@@ -362,29 +364,6 @@ def _flight_warnings(
     if refused:
         warnings.append(f"files that cannot be used: {len(refused)}")
     return warnings
-
-
-# ---------------------------------------------------------------------- time and memory
-
-
-def _estimated_time_s(shots: Sequence[Shot], options: Options) -> float | None:
-    """Time a few photographs on this machine and extrapolate; None for neural backbones, which nothing here times."""
-    if not shots or options.backbone.backbone != "classical":
-        return None
-    sample = shots[:: max(1, len(shots) // TIMED_PHOTOGRAPHS)][:TIMED_PHOTOGRAPHS]
-    extractor = new_extractor(options.backbone.features)
-    began = time.perf_counter()
-    for shot in sample:
-        rgb = load_working_image(shot, options.backbone.working_px).rgb
-        extract_features(rgb, options.backbone.features, extractor)
-    features_s = (time.perf_counter() - began) / len(sample) / (options.backbone.threads or os.cpu_count() or 1)
-    dense = min(1.0, options.backbone.dense_px / options.backbone.working_px) ** 2
-    return len(shots) * features_s * (1.0 + SPARSE_FACTOR + DENSE_FACTOR * dense)
-
-
-def _estimated_memory_mib(count: int, options: Options) -> float:
-    size = (options.backbone.working_px / 1000.0) ** 2
-    return BASE_MIB + size * min(MOST_IMAGES_MIB, IMAGES_MIB * count)
 
 
 def _median(values: Sequence[float | None]) -> float | None:

@@ -108,7 +108,11 @@ def check(
     out: Out,
     above_ground_m: Annotated[
         float | None,
-        typer.Option(help="flying height; replaces what the drone states above its take-off", metavar="m", min=0.1),
+        typer.Option(
+            help="flying height; default: what the drone states, else measured between photographs",
+            metavar="m",
+            min=0.1,
+        ),
     ] = None,
     json: JsonLines = False,
     **values: Any,
