@@ -21,7 +21,7 @@ QGIS_PROCESS = shutil.which("qgis_process.bin") or shutil.which("qgis_process") 
 RENDERED = {"images": 12, "strips": 3, "image_width_px": 640, "image_height_px": 480}
 
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
-sys.path[:0] = [str(ROOT / "tests" / "qgis"), str(ROOT / "tools"), "/usr/share/qgis/python/plugins"]
+sys.path[:0] = [str(ROOT / "tests" / "qgis"), str(ROOT / "tools")]
 
 
 @pytest.fixture(scope="session")
@@ -109,6 +109,7 @@ def qgis(profiles: Path, core_python: str, modules_before_plugin: set[str]) -> I
     application = QgsApplication([], True, str(profiles / "profiles" / "default"))
     application.setOrganizationName("onthefly3r-tests")
     application.initQgis()
+    sys.path.insert(0, str(Path(application.pkgDataPath()) / "python" / "plugins"))
     import processing
     import qgis.utils
     from processing.core.Processing import Processing
