@@ -24,7 +24,7 @@ from .mapping.state import MapState
 from .mapping.store import Store
 from .options import Options
 from .protocol import Progress, ProgressCallback
-from .records import GpsFix, LocalModel, Rejection, Shot, Submap, Subset, WorkingImage
+from .records import FrameEdge, GpsFix, LocalModel, Rejection, Shot, Submap, Subset, WorkingImage
 from .registration.contextual import incompatible_references
 from .registration.references import scene_spacing
 from .selection.base import Describer
@@ -255,8 +255,11 @@ class Engine:
             self._set_aside_images(outcome)
             return
         number = self.state.next_submap()
-        previous = self.state.last_accepted(1)[0]
-        extra = frame_edges(model, outcome, previous, self.state) if self.options.pose_graph.pose_graph == "se3" else ()
+        extra: tuple[FrameEdge, ...] = ()
+        if self.options.pose_graph.pose_graph == "se3":
+            similar = self._index.top(outcome.accepted, self.options.selection.references)
+            retrieved = {index: [n.index for n in found] for index, found in similar.items()}
+            extra = frame_edges(model, outcome, retrieved, self.state)
         submap = Submap(number, outcome.alignment.map_from_local, (), outcome.edges, extra)
         self.batch_sizes.append(len(outcome.accepted))
         self._commit(model, submap, outcome.accepted)

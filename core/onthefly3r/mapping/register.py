@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import numpy as np
 
 from ..geometry.arrays import Float
-from ..geometry.transforms import Sim3
+from ..geometry.transforms import Rigid3, Sim3, rotation_angle_deg
 from ..options import RegistrationOptions
 from ..records import (
     Alignment,
@@ -35,6 +36,11 @@ from ..registration.validate import (
     validate_references,
 )
 from .state import MapState
+
+# Motion that an image and the one that arrived before it may have for an edge of continuity.
+MAX_TURN_DEG = 45.0
+MAX_STEP_RATIO = 4.0  # of the usual step
+STEPS_REMEMBERED = 50
 
 PositionCheck = Callable[[int, Float, Mapping[int, Float]], float]
 
@@ -175,22 +181,38 @@ def _submap_edges(pairs: Correspondences, state: MapState, residual: float) -> t
 
 
 def frame_edges(
-    model: LocalModel, registration: Registration, previous: int | None, state: MapState
+    model: LocalModel, registration: Registration, retrieved: Mapping[int, Collection[int]], state: MapState
 ) -> tuple[FrameEdge, ...]:
-    """Return the paper's edges (Eq. 15): reference to query, within the batch, and to the frame accepted before."""
-    scale = registration.alignment.map_from_local.scale
+    """Return the paper's edges (Eq. 15): reference to new image, within the batch, and from the image before in time.
+
+    `retrieved` names the frames of the map that each new image is most like.
+    """
+    map_from_local = registration.alignment.map_from_local
     doubt = 1.0 + 2.0 * (1.0 - registration.alignment.inlier_ratio)  # weight follows inlier ratio and residual
     sigma_rotation_rad = doubt * max(np.radians(np.median([r.rotation_deg for r in registration.residuals])), 1e-4)
     sigma_translation = doubt * max(registration.alignment.residual, 1e-6 * state.spacing)
+    placed = {i: map_from_local.apply_to_pose(view.local_from_cam) for i, view in model.views.items()}
 
-    def edge(source: int, target: int, kind: str) -> FrameEdge:
-        local = model.views[source].local_from_cam.inverse() @ model.views[target].local_from_cam
-        scaled = type(local)(local.rotation, scale * local.translation)
-        return FrameEdge(source, target, scaled, float(sigma_rotation_rad), sigma_translation, kind)  # type: ignore[arg-type]
+    def edge(source: int, target: int, kind: Literal["ref", "batch", "cont"], start: Rigid3) -> FrameEdge:
+        relative = start.inverse() @ placed[target]
+        return FrameEdge(source, target, relative, float(sigma_rotation_rad), sigma_translation, kind)
 
     new = registration.accepted
-    edges = [edge(r, q, "ref") for r in registration.alignment.references for q in new]
-    edges += [edge(a, b, "batch") for i, a in enumerate(new) for b in new[i + 1 :]]
-    if previous is not None and previous in model.views and previous not in registration.alignment.references:
-        edges += [edge(previous, q, "cont") for q in new[:1]]
+    edges = [edge(r, q, "ref", placed[r]) for r in registration.alignment.references for q in new]
+    edges += [edge(a, b, "batch", placed[a]) for i, a in enumerate(new) for b in new[i + 1 :]]
+    longest = MAX_STEP_RATIO * _usual_step(state)
+    for q in new:
+        if q - 1 in state.frames and q - 1 in retrieved[q]:  # shots are numbered as they arrive
+            candidate = edge(q - 1, q, "cont", state.map_from_cam(q - 1))
+            turn_deg = rotation_angle_deg(candidate.source_from_target.rotation)
+            step = float(np.linalg.norm(candidate.source_from_target.translation))
+            if turn_deg <= MAX_TURN_DEG and step <= longest:
+                edges.append(candidate)
     return tuple(edges)
+
+
+def _usual_step(state: MapState) -> float:
+    """Return the median distance of images that arrived one after the other, among the frames placed last."""
+    pairs = [(i - 1, i) for i in state.last_accepted(STEPS_REMEMBERED) if i - 1 in state.frames]
+    steps = [np.linalg.norm(state.map_from_cam(a).translation - state.map_from_cam(b).translation) for a, b in pairs]
+    return float(np.median(steps)) if steps else 0.0
