@@ -190,7 +190,7 @@ def test_windows_overlap_by_half() -> None:
 def test_a_loop_is_the_most_similar_pair_of_chunks_that_are_no_neighbours() -> None:
     windows = chunk_windows(20, 8)
     similarity = np.zeros((20, 20))
-    similarity[1, 14], similarity[2, 15], similarity[0, 5], similarity[3, 17] = 0.7, 0.9, 0.99, 0.5
+    similarity[1, 14], similarity[2, 15], similarity[0, 10], similarity[3, 17] = 0.7, 0.9, 0.99, 0.5
     assert find_loops(windows, np.maximum(similarity, similarity.T)) == [(2, 15)]
 
 
