@@ -36,9 +36,11 @@ QUALITIES: dict[str, dict[str, int]] = {
 # With parameters of their own, or of no use in QGIS.
 NOT_SHOWN = {"crs", "boundary", "backbone", "vertical", "positions", "cloud"}
 AS_BEFORE = "as before"
+UNITS = ("m", "px", "mm", "deg", "GiB")  # shown in titles; the others only say what is counted
 # Titles where the option's name alone says too little to somebody who does not know the command line.
 TITLES = {
     "recursive": "Search sub-folders too",
+    "min_side_px": "Shortest side allowed",
     "limit": "Use only the first photographs",
     "focal_35mm": "Focal length, 35-mm equivalent",
     "working_px": "Size of the photographs while reconstructing",
@@ -151,7 +153,7 @@ def option_parameter(item: dataclasses.Field) -> QgsProcessingParameterDefinitio
     """Return the parameter of one option, named like it in capitals."""
     facts, name, kind = item.metadata, item.name.upper(), str(item.type)
     title = tr(TITLES.get(item.name) or plain_title(item.name))
-    if facts["unit"]:
+    if facts["unit"] in UNITS:
         title += f" [{facts['unit']}]"
     if facts["choices"]:
         return words_parameter(name, title, facts["choices"], item.default)
@@ -175,7 +177,8 @@ def plain_title(name: str) -> str:
     """Return an option's name as words, without the unit that it ends in."""
     words = name.split("_")
     words = words[:-1] if words[-1] in ("m", "px", "deg", "gib") else words
-    return " ".join(["GPS" if word == "gps" else word for word in words]).capitalize().replace("Gps", "GPS")
+    words = [word.upper() if word in ("gps", "gpu") else word for word in words]
+    return " ".join([words[0][0].upper() + words[0][1:], *words[1:]])
 
 
 def option_help(item: dataclasses.Field) -> str:

@@ -64,6 +64,22 @@ def test_values_have_the_types_of_the_core(options_of: Any, plugin: Any, tmp_pat
     assert plugin("core.onthefly3r.options").Options.from_flat(named).selection.seed_size == 20
 
 
+@pytest.mark.parametrize(
+    ("name", "title"),
+    [
+        ("WORKING_PX", "Size of the photographs while reconstructing [px]"),
+        ("MAX_GPU_MEMORY_GIB", "Max GPU memory [GiB]"),
+        ("SEED_SIZE", "Seed size"),
+        ("GPS_CANDIDATES", "GPS candidates"),
+    ],
+)
+def test_titles(qgis: Any, name: str, title: str) -> None:
+    from qgis.core import QgsApplication
+
+    algorithm = QgsApplication.processingRegistry().algorithmById("onthefly3r:reconstruct")
+    assert algorithm.parameterDefinition(name).description() == title
+
+
 def test_degrees_are_refused(options_of: Any) -> None:
     from qgis.core import QgsProcessingException
 
