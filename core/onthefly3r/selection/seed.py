@@ -9,7 +9,6 @@ import numpy as np
 from ..geometry.arrays import Float
 
 CONNECTING_NEIGHBOURS = 5
-BLOB_LINKS = 10  # links by which a blob grows: more make it rounder, and a round one bends least
 MAX_STARTS = 200  # of many images, so many evenly spread ones are looked at as starts
 
 
@@ -43,11 +42,11 @@ def choose_seed(
     affinity[np.arange(len(starts)), starts] = -np.inf
     density = np.partition(affinity, -neighbours, axis=1)[:, -neighbours:].mean(axis=1)
     chosen = [starts[int(np.argmax(density))]]
-    links = np.zeros((len(candidates), BLOB_LINKS))  # the best ones of each candidate to the blob
+    links = np.zeros((len(candidates), neighbours))  # the best ones of each candidate to the blob
     while len(chosen) < min(size, len(candidates)):
         new = similarities(candidates, [candidates[chosen[-1]]])
         links = np.sort(np.column_stack([links, new]), axis=1)[:, 1:]
-        # Few links count less: an image must hang on many members, so that the blob stays round.
+        # Few links count less: an image must hang on several members, not on one.
         attraction = links.sum(axis=1)
         attraction[chosen] = -np.inf
         chosen.append(int(np.argmax(attraction)))
