@@ -94,7 +94,16 @@ class Pictures:
     def __init__(self) -> None:
         self.photographs, self.out = Path(os.environ[PHOTOGRAPHS]), Path(os.environ[OUT])
         self.work = self.out / "work"
-        self.steps = [self.toolbox, self.dialog, self.check, self.checked_map, self.run, self.result_map, self.report]
+        self.steps = [
+            self.toolbox,
+            self.dialog,
+            self.all_dialogs,
+            self.check,
+            self.checked_map,
+            self.run,
+            self.result_map,
+            self.report,
+        ]
 
     def start(self) -> None:
         """Begin when the desktop has come up."""
@@ -147,11 +156,26 @@ class Pictures:
         self._dialog = dialog
         self._later(SETTLE_MS // 2, lambda: self._save(dialog, "qgis-reconstruct.png"))
 
+    def all_dialogs(self) -> None:
+        """Every algorithm can be opened, for one run and as a batch."""
+        import processing
+        from processing.gui.BatchAlgorithmDialog import BatchAlgorithmDialog
+        from qgis.core import QgsApplication
+        from qgis.utils import iface
+
+        self._dialog.close()
+        for algorithm in QgsApplication.processingRegistry().providerById("onthefly3r").algorithms():
+            dialog = processing.createAlgorithmDialog(algorithm.id(), {})
+            batch = BatchAlgorithmDialog(algorithm.create(), iface.mainWindow())
+            for opened in (dialog, batch):
+                opened.show()
+                opened.close()
+                opened.deleteLater()
+
     def check(self) -> None:
         """Photographs looked at before."""
         import processing
 
-        self._dialog.close()
         processing.runAndLoadResults(
             "onthefly3r:check",
             {"PHOTOS": str(self.photographs), "CHECKED": self._layer(), "FOOTPRINTS": self._layer()},
