@@ -66,6 +66,8 @@ class ExportCloud(EarlierRunAlgorithm):
         path = self.parameterAsFileOutput(parameters, OUTPUT, context)
         if _format(path) not in FORMATS:
             return False, tr("{} ends neither in .laz nor in .las.").format(path)
+        if path.lower().endswith(".copc.laz"):
+            return False, tr("{}: clouds are written as plain LAZ, not as COPC: leave out .copc.").format(path)
         return super().checkParameterValues(parameters, context)
 
     def processAlgorithm(
@@ -73,7 +75,7 @@ class ExportCloud(EarlierRunAlgorithm):
     ) -> dict[str, Any]:
         """Export into a scratch folder and keep the cloud."""
         run = self.run_folder(parameters, context)
-        out = Path(self.parameterAsFileOutput(parameters, OUTPUT, context))
+        out = self._destination(parameters, context)
         options = {**options_from(self, parameters, context, every=True), "format": _format(str(out))}
         with scratch_folder(out) as scratch, boundary_file(self, parameters, context) as boundary:
             self.export(run, scratch, {**options, "boundary": boundary}, feedback)
@@ -93,6 +95,12 @@ class ExportCloud(EarlierRunAlgorithm):
             "SPACING": cloud["mean_spacing_m"],
             "CRS_OUT": geo.get("crs", ""),
         }
+
+    def _destination(self, parameters: dict[str, Any], context: QgsProcessingContext) -> Path:
+        """Return the file, and have QGIS load it where it is a layer to QGIS."""
+        if isinstance(self.parameterDefinition(OUTPUT), QgsProcessingParameterFileDestination):
+            return Path(self.parameterAsFileOutput(parameters, OUTPUT, context))
+        return Path(self.parameterAsOutputLayer(parameters, OUTPUT, context))
 
 
 def _format(path: str) -> str:

@@ -56,6 +56,14 @@ class OnTheFly3RProvider(QgsProcessingProvider):
         """Return the icon's file."""
         return str(ICONS / "onthefly3r.svg")
 
+    def supportedOutputPointCloudLayerExtensions(self) -> list[str]:
+        """Return the endings of clouds; asked from QGIS 3.24 on."""
+        return ["laz", "las"]
+
+    def defaultPointCloudFileExtension(self) -> str:
+        """Return the ending of temporary clouds; asked from QGIS 3.24 on."""
+        return "laz"
+
     def load(self) -> bool:
         """Add the settings to Processing's options page, then the algorithms."""
         from processing.core.ProcessingConfig import ProcessingConfig, Setting
