@@ -54,6 +54,8 @@ def test_what_arrives_later_is_found_too(monkeypatch: pytest.MonkeyPatch, kept: 
         one_by_one.top(queries, 3)
     for i in range(110, 150):
         one_by_one.add(10 * i, vectors[i])
+    for index in (at_once, one_by_one):
+        index.accept([10 * i for i in range(115, 150)])
     for query, found in at_once.top(queries, 5).items():
         again = one_by_one.top(queries, 5)[query]
         assert [n.index for n in again] == [n.index for n in found]
