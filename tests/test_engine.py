@@ -14,8 +14,8 @@ from onthefly3r.errors import Cancelled, PhotographError
 from onthefly3r.mapping.state import MapState
 from onthefly3r.mapping.store import Store
 from onthefly3r.options import Options
-from onthefly3r.simulate.oracle import Faults, OracleDescriber, oracle_shots
-from oracle_runs import NO_GPS, camera_errors, run, survey_of
+from onthefly3r.simulate.oracle import Faults, OracleBackbone, OracleDescriber, oracle_shots
+from oracle_runs import GRID_PX, NO_GPS, camera_errors, run, survey_of
 
 # The paper's ablation: dynamic batching, validation and retry, pose graph.
 CASES = {
@@ -165,6 +165,24 @@ def test_images_that_share_nothing_leave_reasons(tmp_path: Path) -> None:
     engine.finish()
     assert not engine.state.frames
     assert {r.stage for r in engine.rejections.values()} == {"seed"} and len(engine.rejections) == 2
+
+
+def test_while_images_arrive_no_seed_is_the_last(tmp_path: Path) -> None:
+    """Most images of every seed are bad: attempts go on as more arrive, and nothing is given up before the end."""
+    engine = empty_engine(tmp_path)
+    engine._backbone = OracleBackbone(
+        survey_of(60, 4), None, Faults(bad_queries=28, bad_query_rate=1.0, in_seed=True), 0, False, GRID_PX
+    )
+    calls = []
+    for shot in oracle_shots(survey_of(60, 4)):
+        engine.add(shot)
+        calls.append(engine.backbone_calls)
+    assert 0 == calls[28] < calls[29] < calls[-1] <= 10
+    assert not engine.state.frames and not engine.rejections
+    engine.finish()
+    assert not engine.state.frames
+    assert len(engine.rejections) == 60 and {r.stage for r in engine.rejections.values()} == {"seed"}
+    assert all(r.numbers["attempts"] > 0 for r in engine.rejections.values())
 
 
 def test_cancelling_ends_the_run_and_keeps_what_was_placed(tmp_path: Path) -> None:

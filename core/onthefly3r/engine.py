@@ -145,6 +145,8 @@ class Engine:
     def finish(self) -> None:
         """Place what is still waiting, retry what was set aside, and remove the drift."""
         self._describe_pending(force=True)
+        if not self.state.frames:
+            self._refused_seeds.clear()  # now that all images are there
         self._advance(finishing=True)
         self._settle()
         if self.options.pose_graph.refine and self.state.frames:
@@ -198,12 +200,14 @@ class Engine:
         """Find a seed that hangs together (Eq. 1, Eq. 3); return whether there is a map now."""
         size = self.options.selection.seed_size
         while self._waiting and (finishing or len(self._waiting) >= size):
-            if len(self._refused_seeds) >= SEED_ATTEMPTS and not finishing:
-                return False
+            if not finishing and len(self._refused_seeds) >= SEED_ATTEMPTS * len(self._waiting) // size:
+                return False  # more images make more attempts worth while
             # Attempts after the first few are smaller: a small group may hang together where a large one does not.
             wanted = size if len(self._refused_seeds) < SEED_ATTEMPTS else max(5, size // 3)
             seed = choose_seed(self._waiting, self._index.similarities, wanted, frozenset(self._refused_seeds))
             if len(seed) < 3 or len(self._refused_seeds) > 3 * SEED_ATTEMPTS:
+                if not finishing:
+                    return False
                 for index in self._waiting:
                     self._reject(
                         (index,),
