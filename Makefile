@@ -1,7 +1,7 @@
 # Shortcuts; bootstrap.py does the work and runs where there is no make.
-.PHONY: setup demo test format docs
+.PHONY: setup demo test package format docs
 
-setup demo test:
+setup demo test package:
 	python3 bootstrap.py $@
 
 format:

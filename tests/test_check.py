@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
+from typer.testing import CliRunner
 
 from onthefly3r import estimate
 from onthefly3r.check import CheckedPhotograph, check_photographs, write_check
+from onthefly3r.cli import app
 from onthefly3r.errors import Cancelled, InputError
 from onthefly3r.options import Options
 from onthefly3r.protocol import Progress
@@ -187,6 +189,16 @@ def test_files(survey: Path, tmp_path: Path) -> None:
         rows = list(csv.DictReader(stream))
     assert rows[0]["problems"] == "one; two" and "footprint" not in rows[0]
     assert float(rows[1]["x"]) == checked.photographs[1].x
+
+
+def test_command_line(survey: Path, tmp_path: Path) -> None:
+    ran = CliRunner().invoke(app, ["check", str(survey), str(tmp_path), "--above-ground-m", "40", "--json"])
+    assert ran.exit_code == 0
+    events = [json.loads(line) for line in ran.stdout.splitlines()]
+    assert [event["kind"] for event in events] == ["progress"] * 12 + ["warning", "result"]
+    assert "of the ground is in three photographs" in events[-2]["message"]
+    assert events[-1]["above_ground_m"] == 40.0 and events[-1]["given"] == 12
+    assert events[-1]["check"] == str(tmp_path / "check.json") and (tmp_path / "check.csv").is_file()
 
 
 def test_progress_and_cancelling(survey: Path) -> None:
