@@ -98,6 +98,21 @@ def test_enums_are_fully_qualified(archive: zipfile.ZipFile) -> None:
             assert not short.search(archive.read(name).decode("utf-8")), name
 
 
+def test_what_qgis_imports_is_python_3_9(archive: zipfile.ZipFile) -> None:
+    """QGIS 3.22 brings Python 3.9 on Windows and macOS."""
+    core = "|".join(("__init__", "errors", "options", "protocol"))
+    own = re.compile(rf"{NAME}/(__init__\.py|(plugin|processing_algorithms)/.*\.py|core/onthefly3r/({core})\.py)")
+    read = [name for name in archive.namelist() if own.fullmatch(name)]
+    assert len(read) > 20
+    for name in read:
+        tree = ast.parse(archive.read(name), feature_version=(3, 9))
+        newer = [node for node in ast.walk(tree) if isinstance(node, ast.keyword) and node.arg == "strict"]
+        assert not newer, name
+        first = next((node for node in tree.body if not isinstance(node, ast.Expr)), ast.Pass())
+        annotated = any(isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitOr) for node in ast.walk(tree))
+        assert not annotated or "annotations" in ast.unparse(first), name
+
+
 def test_same_source_same_zip(tmp_path: Path) -> None:
     from package_plugin import package
 
