@@ -30,8 +30,9 @@ def bundle_of(truth: synthetic.Block, free: bool = True, prior: IntrinsicsPrior 
         keys=(synthetic.KEY,) * len(images),
         free=keys,
         cameras={synthetic.KEY: truth.camera},
-        mean=np.array([prior.mean() for _ in keys]).reshape(-1, 6),
-        whitening=np.array([prior.whitening() for _ in keys]).reshape(-1, 6, 6),
+        mean=np.array([prior.mean() for _ in keys]).reshape(-1, 8),
+        whitening=np.array([prior.whitening() for _ in keys]).reshape(-1, 8, 8),
+        adjustable=np.ones(8, bool),
     )
 
 
@@ -42,7 +43,7 @@ def state_of(truth: synthetic.Block, turn_deg: float = 0.0, shift: float = 0.0, 
         np.array([model.local_from_cam[i].rotation for i in images]),
         np.array([model.local_from_cam[i].translation for i in images]),
         model.points,
-        np.array([intrinsics_of(truth.camera)] if free else []).reshape(-1, 6),
+        np.array([intrinsics_of(truth.camera)] if free else []).reshape(-1, 8),
     )
 
 
@@ -61,7 +62,9 @@ def camera_error(truth: synthetic.Block, state: State) -> float:
 def test_intrinsics_survive_the_round_trip() -> None:
     camera = replace(synthetic.CAMERA, fx=790.0)
     again = with_intrinsics(camera, intrinsics_of(camera))
-    assert np.allclose((again.fx, again.fy, *again.distortion), (camera.fx, camera.fy, *camera.distortion))
+    assert np.allclose(
+        (again.fx, again.cx, again.cy, *again.distortion), (camera.fx, camera.cx, camera.cy, *camera.distortion)
+    )
 
 
 def test_projection_derivatives_are_those_of_the_projection() -> None:
@@ -74,7 +77,7 @@ def test_projection_derivatives_are_those_of_the_projection() -> None:
         assert np.allclose(by_seen[:, :, k], numeric, atol=1e-5)
     parameters = intrinsics_of(synthetic.CAMERA)
     for k in range(len(PARAMETERS)):
-        step = 1e-6 * np.eye(6)[k]
+        step = 1e-6 * np.eye(8)[k]
         more, less = (with_intrinsics(synthetic.CAMERA, parameters + sign * step) for sign in (1.0, -1.0))
         numeric = (more.project(seen) - less.project(seen)) / 2e-6
         assert np.allclose(by_parameters[:, :, k], numeric, rtol=1e-5, atol=1e-3)
@@ -83,24 +86,24 @@ def test_projection_derivatives_are_those_of_the_projection() -> None:
 def test_steps_in_poses_and_points_have_the_derivatives_it_uses(truth: synthetic.Block) -> None:
     bundle, state = bundle_of(truth), state_of(truth)
     by_pose, by_intrinsics, by_point = bundle.jacobians(state)
-    size = 6 * len(truth.poses) + 6
+    size = 6 * len(truth.poses) + 8
     rng = np.random.default_rng(2)
     dc, dp = 1e-5 * rng.standard_normal(size), 1e-4 * rng.standard_normal(state.points.shape)
     moved = bundle.residuals(bundle.moved(state, dc, dp)) - bundle.residuals(bundle.moved(state, -dc, -dp))
-    poses = dc[:-6].reshape(-1, 6)[bundle.image]
-    predicted = np.einsum("mij,mj->mi", by_pose, poses) + by_intrinsics @ dc[-6:]
+    poses = dc[:-8].reshape(-1, 6)[bundle.image]
+    predicted = np.einsum("mij,mj->mi", by_pose, poses) + by_intrinsics @ dc[-8:]
     predicted += np.einsum("mij,mj->mi", by_point, dp[bundle.point])
     assert np.allclose(moved, -2.0 * predicted, atol=2e-5)
 
 
 @pytest.mark.parametrize("free", [False, True])
 def test_cameras_come_back_from_a_disturbed_start(truth: synthetic.Block, free: bool) -> None:
-    """Noise 0.3 px at 800 px focal length and 50 m: centimetres."""
+    """Noise 0.3 px at 800 px focal length and 50 m: centimetres, twice as many with the lens unknown."""
     bundle, start = bundle_of(truth, free), state_of(truth, turn_deg=0.5, shift=0.5, free=free)
     solved, _ = bundle.minimised(start, bundle.noise_px(start))
     solved, _ = bundle.minimised(solved, bundle.noise_px(solved))
     assert camera_error(truth, start) > 0.4
-    assert camera_error(truth, solved) < 0.05
+    assert camera_error(truth, solved) < (0.1 if free else 0.05)
     assert bundle.noise_px(solved) == pytest.approx(0.3, rel=0.1)
 
 
@@ -121,7 +124,7 @@ def test_stated_precision_of_the_focal_length_is_its_scatter() -> None:
     for seed in range(20):
         truth = synthetic.block(rows=2, columns=3, n_points=400, noise_px=0.5, seed=3)
         rng = np.random.default_rng(100 + seed)
-        bundle = bundle_of(truth, prior=IntrinsicsPrior(truth.camera, 10.0, 10.0, 10.0, 10.0, 10.0))
+        bundle = bundle_of(truth, prior=IntrinsicsPrior(truth.camera, 10.0, 10.0, 10.0, 10.0, 10.0, 10.0))
         bundle = replace(bundle, pixel=bundle.pixel + 0.5 * rng.standard_normal(bundle.pixel.shape))
         solved, _ = bundle.minimised(state_of(truth), np.sqrt(0.5))
         normal = bundle.normal_equations(solved, np.sqrt(0.5))

@@ -66,7 +66,7 @@ def test_prior_counts_displacements_at_the_corner() -> None:
     prior = IntrinsicsPrior(GUESS, 0.05, corner_sigma=0.01)
     corner = 0.5 * np.hypot(1000.0 / 840.0, 750.0 / 840.0)
     k1 = 0.01 / corner**2  # alone it moves the corner by one standard deviation
-    deviation = prior.whitening() @ np.array([0.0, 0.0, k1, 0.0, 0.0, 0.0])
+    deviation = prior.whitening() @ np.array([0.0, 0.0, k1, 0.0, 0.0, 0.0, 0.0, 0.0])
     assert deviation[2] == pytest.approx(1.0)
 
 
@@ -74,3 +74,15 @@ def test_an_image_counts_as_a_few_observations() -> None:
     weights = effective_weight(np.repeat([0, 1], [4, 400]))
     assert weights[:4] == pytest.approx(1.0)
     assert weights[4:].sum() == pytest.approx(10.0)
+
+
+def test_principal_point_is_held_unless_asked_for() -> None:
+    """Features of a lens that sits 8 px off the middle; held, it stays there, and is found to a few pixels otherwise."""
+    truth = synthetic.block(rows=4, columns=6, n_points=2000, noise_px=0.1)
+    moved = {i: replace(f, pixels=f.pixels + np.float32([8.0, -8.0])) for i, f in truth.features.items()}
+    model, keys = synthetic.sparse_model(truth), dict.fromkeys(truth.poses, synthetic.KEY)
+    priors = {synthetic.KEY: IntrinsicsPrior(synthetic.CAMERA, 0.01)}
+    held = self_calibrate(model, moved, keys, priors).model.cameras[synthetic.KEY]
+    found = self_calibrate(model, moved, keys, priors, principal_point=True).model.cameras[synthetic.KEY]
+    assert (held.cx, held.cy) == (500.0, 375.0)
+    assert np.hypot(found.cx - 508.0, found.cy - 367.0) < 4.0

@@ -398,7 +398,12 @@ class Engine:
     def _refine(self) -> None:
         with self.stopwatch.stage("refinement"):
             self._checkpoint("refining the cameras", 0, 1)
-            refined = refine(self.state, self.store.stream_observations(), self.shots)
+            refined = refine(
+                self.state,
+                self.store.stream_observations(),
+                self.shots,
+                self.options.backbone.principal_point,
+            )
             if refined is not None:
                 self.state.move_refined(refined.map_from_submap, refined.calibrations)
                 self.refinement = refined.notes

@@ -109,6 +109,12 @@ class BackboneOptions:
     )
     features: int = option(4000, "most local features per image", unit="features", minimum=200, advanced=True)
     dense_px: int = option(500, "longest side of the dense point maps", unit="px", minimum=64, maximum=8000)
+    principal_point: bool = option(
+        False,
+        "estimate the principal point of the cameras too; it is held in the middle of the image otherwise, as COLMAP "
+        "does by default",
+        advanced=True,
+    )
     threads: int = option(0, "processor cores to use; 0 takes all", unit="cores", minimum=0)
     weights: str | None = option(
         None, "weights of a neural backbone: a file, a folder, or a hub id with its revision (owner/name@revision)"

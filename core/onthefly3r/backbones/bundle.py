@@ -32,7 +32,7 @@ class State:
     rotations: Float  # (I, 3, 3) local_from_cam
     centres: Float  # (I, 3) local frame
     points: Float  # (N, 3) local frame
-    intrinsics: Float  # (K, 6) PARAMETERS of the free keys
+    intrinsics: Float  # (K, 8) PARAMETERS of the free keys
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class NormalEquations:
     cc: Any  # (D, D) sparse
     pp: Float  # (N, 3, 3)
     pose_point: Float  # (M, 6, 3)
-    intrinsics_point: Float  # (K, N, 6, 3)
+    intrinsics_point: Float  # (K, N, 8, 3)
     c: Float  # (D,) negative gradient
     p: Float  # (N, 3)
     image: Int  # (M,)
@@ -74,7 +74,7 @@ class NormalEquations:
         return dc, np.einsum("nij,nj->ni", root, (p - cp.T @ dc).reshape(-1, 3))
 
     def intrinsics_covariance(self) -> Float:
-        """Return the covariance (6K, 6K) of the free intrinsics, poses and points marginalised."""
+        """Return the covariance (8K, 8K) of the free intrinsics, poses and points marginalised."""
         n_shared = len(self.intrinsics_point) * len(PARAMETERS)
         wanted = np.eye(len(self.c))[:, len(self.c) - n_shared :]
         return self._solved(self.eliminated(0.0)[2], wanted)[len(self.c) - n_shared :]
@@ -101,9 +101,10 @@ class Bundle:
     weight: Float  # (M,) information relative to an independent observation
     keys: tuple[str, ...]  # (I,) camera key of each image
     free: tuple[str, ...]  # (K,) camera keys whose intrinsics are estimated
-    cameras: Mapping[str, Camera]  # by key; of a free key only size and principal point are used
-    mean: Float  # (K, 6)
-    whitening: Float  # (K, 6, 6)
+    cameras: Mapping[str, Camera]  # by key; of a free key only the size is used
+    mean: Float  # (K, 8)
+    whitening: Float  # (K, 8, 8)
+    adjustable: Bool  # (8,) which of PARAMETERS may change
 
     def camera(self, key: str, state: State) -> Camera:
         """Return the camera of a key in this state."""
@@ -137,7 +138,7 @@ class Bundle:
         return float(self.weight @ huber + prior.sum())
 
     def deviation(self, state: State) -> Float:
-        """Return the intrinsics minus the prior mean (K, 6), in standard deviations of the priors."""
+        """Return the intrinsics minus the prior mean (K, 8), in standard deviations of the priors."""
         return np.asarray(np.einsum("kij,kj->ki", self.whitening, state.intrinsics - self.mean))
 
     def normal_equations(self, state: State, noise_px: float) -> NormalEquations:
@@ -164,7 +165,7 @@ class Bundle:
         )
 
     def jacobians(self, state: State) -> tuple[Float, Float, Float]:
-        """Return d pixel / d (rotation, centre) (M, 2, 6), d intrinsics (M, 2, 6) and d point (M, 2, 3).
+        """Return d pixel / d (rotation, centre) (M, 2, 6), d intrinsics (M, 2, 8) and d point (M, 2, 3).
 
         A rotation is perturbed on the camera's side, R exp(w); intrinsics that are held have zeros.
         """
@@ -174,7 +175,7 @@ class Bundle:
             rows = self._rows(key)
             by_seen[rows], derivative = projection_jacobians(self.camera(key, state), seen[rows])
             if key in self.free:
-                by_intrinsics[rows] = derivative
+                by_intrinsics[rows] = derivative * self.adjustable
         by_point = by_seen @ np.swapaxes(state.rotations, 1, 2)[self.image]
         by_rotation = np.cross(by_seen, seen[:, None, :])  # the point moves by seen x w
         return np.concatenate([by_rotation, -by_point], axis=2), by_intrinsics, by_point
@@ -225,19 +226,19 @@ class Bundle:
         key = np.array([self.free.index(k) if k in self.free else -1 for k in self.keys])
         of_free = np.flatnonzero(key >= 0)
         poses = sparse.block_diag(self._by_image(pose_t @ by_pose))
-        mixed = sparse.lil_matrix((6 * n_images, 6 * n_keys))
-        own = np.zeros((n_keys, 6, 6))
+        size = len(PARAMETERS)
+        mixed = sparse.lil_matrix((6 * n_images, size * n_keys))
+        own, shared = np.zeros((n_keys, size, size)), np.zeros((n_keys, size))
         crossed, squared = self._by_image(pose_t @ by_intrinsics), self._by_image(intrinsics_t @ by_intrinsics)
         for image in of_free:
-            mixed[6 * image : 6 * image + 6, 6 * key[image] : 6 * key[image] + 6] = crossed[image]
+            mixed[6 * image : 6 * image + 6, size * key[image] : size * (key[image] + 1)] = crossed[image]
             own[key[image]] += squared[image]
-        right = np.zeros((n_images + n_keys, 6))
-        right[:n_images] = self._by_image(np.einsum("mki,mk->mi", by_pose, residual))
         gradient = self._by_image(np.einsum("mki,mk->mi", by_intrinsics, residual))
-        np.add.at(right, n_images + key[of_free], gradient[of_free])
+        np.add.at(shared, key[of_free], gradient[of_free])
+        right = np.append(self._by_image(np.einsum("mki,mk->mi", by_pose, residual)), shared)
         if n_keys == 0:
-            return poses.tocsr(), right.ravel()
-        return sparse.bmat([[poses, mixed], [mixed.T, sparse.block_diag(own)]], format="csr"), right.ravel()
+            return poses.tocsr(), right
+        return sparse.bmat([[poses, mixed], [mixed.T, sparse.block_diag(own)]], format="csr"), right
 
     def _by_image(self, values: Float) -> Float:
         order = np.argsort(self.image, kind="stable")

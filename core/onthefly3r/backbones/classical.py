@@ -74,7 +74,7 @@ class ClassicalBackbone:
     ) -> SparseModel:
         sigma = {keys[i]: images[i].shot.focal_ratio_sigma for i in model.local_from_cam}
         priors = {key: IntrinsicsPrior(cameras[key], sigma[key]) for key in sigma if key not in held}
-        return self_calibrate(model, features, keys, priors, held).model
+        return self_calibrate(model, features, keys, priors, held, self._options.principal_point).model
 
     def _to_local_model(
         self,

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..geometry.arrays import Float, Int
+from ..geometry.arrays import Bool, Float, Int
 from ..geometry.camera import Camera
 from ..geometry.transforms import Rigid3
 from ..records import Features
 from .bundle import Bundle, State
-from .intrinsics import PARAMETERS, intrinsics_of
+from .intrinsics import PARAMETERS, WITHOUT_PRINCIPAL_POINT, intrinsics_of
 from .local_sfm import SparseModel
 
 EFFECTIVE_OBSERVATIONS = 10.0  # independent observations that one image is worth
@@ -27,7 +27,7 @@ SCALE_ROUNDS = 2  # how often the pixel noise is estimated anew
 
 @dataclass(frozen=True)
 class IntrinsicsPrior:
-    """What is known of a camera before its images: the mean, and standard deviations of four kinds of deviation.
+    """What is known of a camera before its images: the mean, and standard deviations of what may deviate.
 
     Distortions are given as displacements at the image corner, as a fraction of its distance from the centre, so
     that they mean the same for a wide and a narrow lens. The radial displacement has two parts: what remains at
@@ -41,20 +41,23 @@ class IntrinsicsPrior:
     corner_sigma: float = 0.005  # of k1 r^2 + k2 r^4 at the corner
     wave_sigma: float = 0.03  # of k2 r^4 at the corner
     tangential_sigma: float = 0.001  # of p1 r and p2 r at the corner
+    centre_sigma: float = 0.003  # of the principal point, as a fraction of the longest side
 
     def mean(self) -> Float:
-        """Return the mean (6,) of `PARAMETERS`."""
+        """Return the mean (8,) of `PARAMETERS`."""
         return intrinsics_of(self.camera)
 
     def whitening(self) -> Float:
-        """Return the matrix (6, 6) that turns a deviation of `PARAMETERS` into standard deviations."""
+        """Return the matrix (8, 8) that turns a deviation of `PARAMETERS` into standard deviations."""
         corner = 0.5 * float(np.hypot(self.camera.width / self.camera.fx, self.camera.height / self.camera.fy))
-        matrix = np.zeros((6, 6))
+        matrix = np.zeros((len(PARAMETERS),) * 2)
         matrix[0, 0] = 1.0 / self.focal_sigma
         matrix[1, 1] = 1.0 / self.aspect_sigma
         matrix[2, 2:4] = np.array([corner**2, corner**4]) / self.corner_sigma
         matrix[3, 3] = corner**4 / self.wave_sigma
         matrix[4, 4] = matrix[5, 5] = corner / self.tangential_sigma
+        longest = max(self.camera.width, self.camera.height)
+        matrix[6, 6], matrix[7, 7] = np.array([self.camera.width, self.camera.height]) / longest / self.centre_sigma
         return matrix
 
 
@@ -63,8 +66,8 @@ class SelfCalibration:
     """The adjusted model, and per free camera key how well its intrinsics are known."""
 
     model: SparseModel
-    sigma: Mapping[str, Float]  # (6,) posterior standard deviation of PARAMETERS
-    shift: Mapping[str, Float]  # (6,) estimate minus prior in prior standard deviations; k1: remainder at the corner
+    sigma: Mapping[str, Float]  # (8,) posterior standard deviation of PARAMETERS
+    shift: Mapping[str, Float]  # (8,) estimate minus prior in prior standard deviations; k1: remainder at the corner
     notes: Mapping[str, float]  # figures for the report
 
 
@@ -74,13 +77,14 @@ def self_calibrate(
     keys: Mapping[int, str],
     priors: Mapping[str, IntrinsicsPrior],
     held: frozenset[str] = frozenset(),
+    principal_point: bool = False,
 ) -> SelfCalibration:
     """Adjust poses, points and the intrinsics of all camera keys outside `held`; the frame stays about the same.
 
     `model` is best built with the free intrinsics at their priors' means. `priors` holds every key that is free;
-    a held key keeps the model's camera. Pixels are of the working images.
+    a held key keeps the model's camera, and without `principal_point` all keep that. Pixels are of the working images.
     """
-    bundle, images = _bundle(model, features, keys, priors, held)
+    bundle, images = _bundle(model, features, keys, priors, held, adjustable(principal_point))
     state = _start(model, images, bundle.free)
     before = np.linalg.norm(bundle.residuals(state), axis=1)
     iterations = 0
@@ -104,6 +108,11 @@ def self_calibrate(
     )
 
 
+def adjustable(principal_point: bool) -> Bool:
+    """Return which of `PARAMETERS` may change."""
+    return WITHOUT_PRINCIPAL_POINT | principal_point
+
+
 def effective_weight(image: Int) -> Float:
     """Return the weights (M,) under which the observations of one image, named by its row, count as a few."""
     count = np.bincount(image)
@@ -116,6 +125,7 @@ def _bundle(
     keys: Mapping[int, str],
     priors: Mapping[str, IntrinsicsPrior],
     held: frozenset[str],
+    may_change: Bool,
 ) -> tuple[Bundle, tuple[int, ...]]:
     images = tuple(sorted(model.local_from_cam))
     image_keys = tuple(keys[i] for i in images)
@@ -140,8 +150,9 @@ def _bundle(
         keys=image_keys,
         free=free,
         cameras=model.cameras,
-        mean=np.array([priors[key].mean() for key in free]).reshape(-1, 6),
-        whitening=np.array([priors[key].whitening() for key in free]).reshape(-1, 6, 6),
+        mean=np.array([priors[key].mean() for key in free]).reshape(-1, len(PARAMETERS)),
+        whitening=np.array([priors[key].whitening() for key in free]).reshape(-1, len(PARAMETERS), len(PARAMETERS)),
+        adjustable=may_change,
     )
     return bundle, images
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..backbones.bundle import Bundle, State
 from ..backbones.intrinsics import PARAMETERS, intrinsics_of
-from ..backbones.selfcal import IntrinsicsPrior, effective_weight
+from ..backbones.selfcal import IntrinsicsPrior, adjustable, effective_weight
 from ..geometry.arrays import Bool, Float, Int
 from ..geometry.camera import Camera
 from ..geometry.transforms import Rigid3, Sim3
@@ -48,7 +48,10 @@ class Refinement:
 
 
 def refine(
-    state: MapState, observed: Iterable[tuple[int, Observations]], shots: Mapping[int, Shot]
+    state: MapState,
+    observed: Iterable[tuple[int, Observations]],
+    shots: Mapping[int, Shot],
+    principal_point: bool = False,
 ) -> Refinement | None:
     """Adjust all cameras that share enough tracks; None when there are none, as with neural backbones.
 
@@ -56,12 +59,13 @@ def refine(
         state: the map; it is only read.
         observed: observations by number of the submap that made them.
         shots: at least those of the map.
+        principal_point: adjust that of the cameras too.
     """
     tracks = chosen_tracks(joined_tracks(state, observed), state.frames)
     images = tuple(int(i) for i in np.unique(tracks.image))
     if len(images) < 3:
         return None
-    bundle = _bundle(tracks, images, state, shots)
+    bundle = _bundle(tracks, images, state, shots, adjustable(principal_point))
     start = _start(tracks, images, state, bundle.free)
     adjusted = start
     for _ in range(NOISE_ROUNDS):
@@ -167,7 +171,9 @@ def _collected(
     return image, feature, pixel, depth, point, np.concatenate(points)
 
 
-def _bundle(tracks: Tracks, images: tuple[int, ...], state: MapState, shots: Mapping[int, Shot]) -> Bundle:
+def _bundle(
+    tracks: Tracks, images: tuple[int, ...], state: MapState, shots: Mapping[int, Shot], may_change: Bool
+) -> Bundle:
     row = np.searchsorted(np.array(images), tracks.image)
     keys = tuple(shots[i].camera_key for i in images)
     free = tuple(sorted(set(keys) & set(state.calibrations)))
@@ -182,6 +188,7 @@ def _bundle(tracks: Tracks, images: tuple[int, ...], state: MapState, shots: Map
         cameras={**{shots[i].camera_key: _camera(i, state, shots) for i in images}},
         mean=np.array([prior.mean() for prior in priors]).reshape(-1, len(PARAMETERS)),
         whitening=np.array([prior.whitening() for prior in priors]).reshape(-1, len(PARAMETERS), len(PARAMETERS)),
+        adjustable=may_change,
     )
 
 
