@@ -21,6 +21,8 @@ def test_features_lie_in_the_image() -> None:
     blocks = np.random.default_rng(1).integers(0, 255, (24, 32, 3), np.uint8)
     rgb = np.kron(blocks, np.ones((10, 10, 1), np.uint8))
     features = extract_features(rgb, max_features=50)
-    assert len(features.pixels) > 40
+    assert len(features.pixels) == 50
+    every = extract_features(rgb, max_features=5000)
+    assert features.scales.min() >= np.sort(every.scales)[-50]
     assert (features.pixels >= 0.0).all() and (features.pixels <= (320.0, 240.0)).all()
     assert len(features.pixels) == len(features.scales) == len(features.angles) == len(features.descriptors)

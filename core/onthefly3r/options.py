@@ -107,7 +107,7 @@ class BackboneOptions:
     working_px: int = option(
         1000, "longest side to which photographs are reduced for reconstruction", unit="px", minimum=200, maximum=8000
     )
-    features: int = option(4000, "most local features per image", unit="features", minimum=200, advanced=True)
+    features: int = option(2500, "most local features per image", unit="features", minimum=200, advanced=True)
     dense_px: int = option(500, "longest side of the dense point maps", unit="px", minimum=64, maximum=8000)
     principal_point: bool = option(
         False,

@@ -21,7 +21,7 @@ from .intrinsics import PARAMETERS, projection_jacobians, with_intrinsics
 HUBER = 1.5  # in standard deviations of a pixel coordinate
 STUDENT = 4.0  # degrees of freedom of the priors: a lens that is far from usual is believed when the images insist
 MAX_ITERATIONS = 40
-CONVERGED = 1e-5  # relative decrease of the cost that ends the iterations
+CONVERGED = 1e-4  # relative decrease of the cost that ends the iterations
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e-9, 1e9
 
 

@@ -32,11 +32,14 @@ def extract_features(rgb: UInt8, max_features: int, extractor: Any = None) -> Fe
     table = np.zeros((0, 4), np.float32)  # what an image without any texture has
     if len(keypoints) > 0:
         table = np.asarray(pycolmap.keypoints_to_matrix(keypoints), np.float32)
+    # The extractor stops at whole levels of the scale space and may give twice as many.
+    largest = np.argsort(-table[:, 2], kind="stable")[:max_features]
+    table = table[largest]
     return Features(
         pixels=table[:, :2],
         scales=table[:, 2],
         angles=table[:, 3],
-        descriptors=np.ascontiguousarray(descriptors.data, np.uint8).reshape(len(table), 128),
+        descriptors=np.asarray(descriptors.data, np.uint8).reshape(-1, 128)[largest],
     )
 
 

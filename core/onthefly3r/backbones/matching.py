@@ -71,20 +71,20 @@ def mutual_matches(first: Features, second: Features) -> Int:
     if not len(first.descriptors) or not len(second.descriptors):
         return np.zeros((0, 2), np.uint32)
     # One matrix product finds all distances: an order faster than building an index for a few thousand features.
-    similarity = (first.descriptors.astype(np.float32) @ second.descriptors.astype(np.float32).T) / DESCRIPTOR_NORM**2
+    similarity = first.descriptors.astype(np.float32) @ second.descriptors.astype(np.float32).T
     best = similarity.argmax(axis=1)
-    mutual = similarity.argmax(axis=0)[best] == np.arange(len(best))
-    rows = np.flatnonzero(mutual)
-    nearest = similarity[rows, best[rows]]
-    similarity[rows, best[rows]] = -1.0
-    second_nearest = similarity[rows].max(axis=1)
-    distance, second_distance = _distance(nearest), _distance(second_nearest)
+    nearest = similarity[np.arange(len(best)), best]
+    # The maximum of a column is an order cheaper than where it is; of equal features the first one counts.
+    candidates = np.flatnonzero(nearest >= similarity.max(axis=0)[best])
+    rows = candidates[np.unique(best[candidates], return_index=True)[1]]
+    similarity[np.arange(len(best)), best] = -1.0
+    distance, second_distance = _distance(nearest[rows]), _distance(similarity.max(axis=1)[rows])
     good = (distance < MAX_RATIO * second_distance) & (distance < MAX_DISTANCE)
     return np.column_stack([rows[good], best[rows[good]]]).astype(np.uint32)
 
 
-def _distance(cosine: Float) -> Float:
-    return np.asarray(np.sqrt(np.maximum(2.0 - 2.0 * cosine, 0.0)))
+def _distance(product: Float) -> Float:
+    return np.asarray(np.sqrt(np.maximum(2.0 - 2.0 * product / DESCRIPTOR_NORM**2, 0.0)))
 
 
 def to_pycolmap_camera(camera: Camera, camera_id: int) -> Any:
