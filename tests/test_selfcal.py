@@ -77,7 +77,7 @@ def test_an_image_counts_as_a_few_observations() -> None:
 
 
 def test_principal_point_is_held_unless_asked_for() -> None:
-    """Features of a lens that sits 8 px off the middle; held, it stays there, and is found to a few pixels otherwise."""
+    """A lens that sits 8 px off the middle: held, it stays in the middle; free, it is found to a few pixels."""
     truth = synthetic.block(rows=4, columns=6, n_points=2000, noise_px=0.1)
     moved = {i: replace(f, pixels=f.pixels + np.float32([8.0, -8.0])) for i, f in truth.features.items()}
     model, keys = synthetic.sparse_model(truth), dict.fromkeys(truth.poses, synthetic.KEY)
