@@ -175,3 +175,21 @@ def test_long_tracks_spread_over_the_image_are_chosen() -> None:
     counts = np.bincount(chosen.image)
     assert 20 < counts[0] < 100
     assert len(counts) == 2  # the others keep a single observation, too few to move them
+
+
+def test_mismatches_and_points_behind_a_camera_do_no_harm(tmp_path: Path, truth: synthetic.Block) -> None:
+    """A twentieth of the observations are at random pixels, and some points were triangulated above the cameras."""
+    state, store = drifted_map(tmp_path, truth)
+    rng = np.random.default_rng(4)
+    spoilt = []
+    for number, found in store.stream_observations():
+        wrong = rng.random(len(found.image)) < 0.05
+        pixel = np.where(wrong[:, None], rng.uniform((0, 0), (1000, 750), found.pixel.shape), found.pixel)
+        above = rng.random(len(found.points)) < 0.02
+        up = state.map_from_submap[number].inverse().apply(np.array([0.0, 0.0, 500.0]))
+        points = np.where(above[:, None], up, found.points)
+        spoilt.append((number, replace(found, pixel=pixel.astype(np.float32), points=points.astype(np.float32))))
+    refined = refine(state, spoilt, synthetic.shots(truth))
+    assert refined is not None
+    state.move_refined(refined.map_from_submap, refined.calibrations)
+    assert errors(state, truth)[0] < 0.15

@@ -58,9 +58,11 @@ def qgis_environ(profiles: Path, core_python: str) -> dict[str, str]:
     """Variables for a QGIS of its own: no settings of the user, the plugin, the core's interpreter."""
     runtime = profiles / "runtime"
     runtime.mkdir(mode=0o700, exist_ok=True)
-    kept = {name: value for name, value in os.environ.items() if name in ("PATH", "LANG", "LC_ALL", "TMPDIR")}
+    kept = {name: value for name, value in os.environ.items() if name in ("LANG", "LC_ALL", "TMPDIR")}
     return {
         **kept,
+        # The Python inside QGIS looks for its modules beside the first python3 of the path: it must be the system's.
+        "PATH": os.pathsep.join(["/usr/bin", "/bin", os.environ.get("PATH", "")]),
         "HOME": str(profiles),
         "XDG_RUNTIME_DIR": str(runtime),
         "QGIS_CUSTOM_CONFIG_PATH": str(profiles),

@@ -23,7 +23,9 @@ from .state import MapState
 OBSERVATIONS = 20_000  # to aim at in all: a small map uses all that it has,
 CELLS = 6  # an image at least
 LEAST_PER_CELL = 3  # of its longest tracks in each of 6 x 6 cells
+MIN_IMAGES = 3
 MIN_OBSERVATIONS = 20  # an image with fewer follows the nearest refined one of its submap
+ABSURD = 0.1  # of the image's longest side: an observation that starts farther off is a mismatch
 NOISE_ROUNDS = 3  # how often the pixel noise is estimated anew; the first one is that of the drift
 
 
@@ -53,7 +55,7 @@ def refine(
     shots: Mapping[int, Shot],
     principal_point: bool = False,
 ) -> Refinement | None:
-    """Adjust all cameras that share enough tracks; None when there are none, as with neural backbones.
+    """Adjust all cameras that share enough tracks; None when there are none (neural backbones), or it does not settle.
 
     Args:
         state: the map; it is only read.
@@ -61,27 +63,33 @@ def refine(
         shots: at least those of the map.
         principal_point: adjust that of the cameras too.
     """
+    may_change = adjustable(principal_point)
     tracks = chosen_tracks(joined_tracks(state, observed), state.frames)
-    images = tuple(int(i) for i in np.unique(tracks.image))
-    if len(images) < 3:
+    if len(_images(tracks)) < MIN_IMAGES:
         return None
-    bundle = _bundle(tracks, images, state, shots, adjustable(principal_point))
+    tracks = _only(tracks, _plausible(tracks, state, shots, may_change))
+    images = _images(tracks)
+    if len(images) < MIN_IMAGES:
+        return None
+    bundle = _bundle(tracks, images, state, shots, may_change)
     start = _start(tracks, images, state, bundle.free)
     adjusted = start
-    for _ in range(NOISE_ROUNDS):
-        noise_px = bundle.noise_px(adjusted)
-        adjusted, _ = bundle.minimised(adjusted, noise_px)
-    if not np.isfinite(adjusted.centres).all():
+    try:
+        for _ in range(NOISE_ROUNDS):
+            adjusted, _ = bundle.minimised(adjusted, bundle.noise_px(adjusted))
+    except (np.linalg.LinAlgError, RuntimeError):  # singular: numpy's word for it and SuperLU's
+        return None
+    before, after = (np.linalg.norm(bundle.residuals(s), axis=1) for s in (start, adjusted))
+    if not np.median(after) <= np.median(before):
         return None
     moved = _moved_frames(tracks, images, state, adjusted)
-    before, after = (np.linalg.norm(bundle.residuals(s), axis=1) for s in (start, adjusted))
     return Refinement(
         map_from_submap=_with_followers(moved, state),
         calibrations={key: bundle.camera(key, adjusted) for key in bundle.free},
         notes={
             "refined_images": float(len(moved)),
             "refined_points": float(len(tracks.points)),
-            "reprojection_before_px": float(np.nanmedian(before)),
+            "reprojection_before_px": float(np.median(before)),
             "reprojection_after_px": float(np.median(after)),
         },
     )
@@ -135,6 +143,20 @@ def chosen_tracks(tracks: Tracks, frames: Mapping[int, object]) -> Tracks:
     tracks = _only(tracks, best[tracks.point])
     enough = np.bincount(tracks.image, minlength=1) >= MIN_OBSERVATIONS
     return _only(tracks, enough[tracks.image])
+
+
+def _plausible(tracks: Tracks, state: MapState, shots: Mapping[int, Shot], may_change: Bool) -> Bool:
+    """Return which observations (M,) lie in front of their cameras and not absurdly far from where they should be."""
+    images = _images(tracks)
+    bundle = _bundle(tracks, images, state, shots, may_change)
+    residual = np.linalg.norm(bundle.residuals(_start(tracks, images, state, bundle.free)), axis=1)
+    longest = np.array([max(shots[i].width_px, shots[i].height_px) for i in images])
+    # False where the residual is NaN, behind the camera.
+    return np.asarray(residual <= ABSURD * longest[np.searchsorted(np.array(images), tracks.image)])
+
+
+def _images(tracks: Tracks) -> tuple[int, ...]:
+    return tuple(int(i) for i in np.unique(tracks.image))
 
 
 def _only(tracks: Tracks, keep: Bool) -> Tracks:
