@@ -45,6 +45,11 @@ class XFeatStore:
         self._known: dict[int, Features] = {}
         self._lock = threading.Lock()
 
+    def prepare(self, images: Mapping[int, WorkingImage]) -> None:
+        """Extract the features of new images."""
+        for index, image in images.items():
+            self.features_of(index, image)
+
     def features_of(self, index: int, image: WorkingImage) -> Features:
         """Return the features of an image: float descriptors (N, 64) of length 1."""
         with self._lock:

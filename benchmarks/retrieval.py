@@ -36,7 +36,7 @@ def descriptors(photos: Path) -> tuple[list[str], dict[str, Float], dict[str, fl
     seconds: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as folder:
         store = FeatureStore(Path(folder), backbone.features)
-        vlad, network = VladDescriber(store.features_of), EfficientNetDescriber()
+        vlad, network = VladDescriber(store), EfficientNetDescriber()
 
         def timed(name: str, index: int, image: WorkingImage) -> None:
             began = time.perf_counter()

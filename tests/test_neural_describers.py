@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from onthefly3r.backbones.features import FeatureStore
 from onthefly3r.errors import MissingDependencyError, OptionError
 from onthefly3r.geometry.camera import PixelMap
 from onthefly3r.networks import efficientnet
 from onthefly3r.options import SelectionOptions
-from onthefly3r.records import Features, Shot, WorkingImage
+from onthefly3r.records import Shot, WorkingImage
 from onthefly3r.selection import neural
 from onthefly3r.selection.choice import create_describer
 from onthefly3r.selection.descriptors import VladDescriber
@@ -102,25 +103,21 @@ def test_efficientnet_finds_neighbours_in_real_photographs(photograph_sets: Path
 
 
 def test_descriptor_is_the_one_that_the_options_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    features = Features(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 128), np.uint8))
-
-    def features_of(index: int, image: WorkingImage) -> Features:
-        return features
-
-    plain = create_describer(SelectionOptions(), features_of, "cpu")
+    features = FeatureStore(tmp_path / "features", 100)
+    plain = create_describer(SelectionOptions(), features, "cpu")
     assert isinstance(plain, VladDescriber)
-    assert plain.features_of is features_of
+    assert plain.features is features
     monkeypatch.setenv("ONTHEFLY3R_WEIGHTS", str(tmp_path))
     for name, describer in (("megaloc", MegaLocDescriber), ("supscene", SupSceneDescriber)):
         monkeypatch.setattr(describer, "packages", ())
         with pytest.raises(OptionError, match=rf"{name}: no weights\. Download .* Then give --descriptor-weights PATH"):
-            create_describer(SelectionOptions(descriptor=name), features_of, "cpu")
+            create_describer(SelectionOptions(descriptor=name), features, "cpu")
         chosen = SelectionOptions(descriptor=name, descriptor_weights="none.pt")
         with pytest.raises(OptionError, match=r"none\.pt: no such file\. Download"):
-            create_describer(chosen, features_of, "cpu")
+            create_describer(chosen, features, "cpu")
     monkeypatch.setattr(EfficientNetDescriber, "packages", ("no_such_package_0",))
     with pytest.raises(MissingDependencyError, match="no_such_package_0 missing; pip install torch"):
-        create_describer(SelectionOptions(descriptor="efficientnet"), features_of, "cpu")
+        create_describer(SelectionOptions(descriptor="efficientnet"), features, "cpu")
 
 
 class FakeNetwork(torch.nn.Module):

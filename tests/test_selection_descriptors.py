@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
@@ -19,8 +22,21 @@ def features(place: int, seed: int, count: int = 80) -> Features:
     return Features(np.zeros((n, 2), np.float32), np.ones(n, np.float32), np.zeros(n, np.float32), descriptors)
 
 
+@dataclass(frozen=True)
+class Known:
+    """Features that need no image."""
+
+    of: dict[int, Features]
+
+    def prepare(self, images: Mapping[int, WorkingImage]) -> None:
+        raise AssertionError("they are there")
+
+    def features_of(self, index: int, image: WorkingImage) -> Features:
+        return self.of[index]
+
+
 def describer(of: dict[int, Features]) -> VladDescriber:
-    return VladDescriber(lambda index, image: of[index])
+    return VladDescriber(Known(of))
 
 
 def images(of: dict[int, Features]) -> dict[int, WorkingImage]:

@@ -43,7 +43,7 @@ def run_one(folder: Path, order: str, strategy: str, seed: int, out: Path, given
             shots=shots,
             load=lambda shot: load_working_image(shot, options.backbone.working_px),
             backbone=create_backbone(options.backbone, features),
-            describer=create_describer(options.selection, features.features_of, options.backbone.device),
+            describer=create_describer(options.selection, features, options.backbone.device),
             work=Path(work) / "map",
             options=given,
         )

@@ -72,9 +72,9 @@ class Counting:
     def __init__(self, inner: Backbone) -> None:
         self._inner = inner
         self.sizes: list[int] = []
-        features_of = getattr(inner, "features_of", None)
-        if features_of is not None:
-            self.features_of = features_of
+        prepare = getattr(inner, "prepare", None)
+        if prepare is not None:
+            self.prepare = prepare
 
     @property
     def spec(self) -> BackboneSpec:

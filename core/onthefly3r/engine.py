@@ -36,6 +36,7 @@ from .selection.seed import choose_seed
 from .selection.subset import build_subset, fixed_subset
 from .stopwatch import Stopwatch
 
+READ_AT_ONCE = 8  # photographs per thread between two steps of progress
 SEED_ATTEMPTS = 5
 MIN_SEED_SHARE = 0.5
 # Drift is removed whenever the map has grown by so many submaps, or by this share: the work stays linear.
@@ -134,12 +135,19 @@ class Engine:
         self.shots.update(new)
         threads = self.options.backbone.threads or os.cpu_count() or 1
         with self.stopwatch.stage("features"), ThreadPoolExecutor(threads) as pool:
-            for done, (index, error) in enumerate(pool.map(self._prepare, new), start=1):
-                self._checkpoint("reading photographs", done, len(new))
-                if error is None:
-                    self._pending.append(index)
-                else:
-                    self._reject((index,), "intake", error.reason, {})
+            for start in range(0, len(new), READ_AT_ONCE * threads):
+                self._checkpoint("reading photographs", start, len(new))
+                some = list(new)[start : start + READ_AT_ONCE * threads]
+                read = dict(zip(some, pool.map(self._read, some), strict=True))
+                good = {index: image for index, image in read.items() if isinstance(image, WorkingImage)}
+                for part in (self._backbone, self._describer):  # what they extract is the same, and extracted once
+                    prepare = getattr(part, "prepare", None)
+                    if prepare is not None and good:
+                        prepare(good)
+                self._pending += good
+                for index, found in read.items():
+                    if isinstance(found, PhotographError):
+                        self._reject((index,), "intake", found.reason, {})
         self._describe_pending(force=False)
 
     def finish(self) -> None:
@@ -152,16 +160,11 @@ class Engine:
         if self.options.pose_graph.refine and self.state.frames:
             self._refine()
 
-    def _prepare(self, index: int) -> tuple[int, PhotographError | None]:
+    def _read(self, index: int) -> WorkingImage | PhotographError:
         try:
-            image = self._images[index]
-            for part in (self._backbone, self._describer):  # what both need is extracted once, in this thread
-                features_of = getattr(part, "features_of", None)
-                if features_of is not None:
-                    features_of(index, image)
+            return self._images[index]
         except PhotographError as error:
-            return index, error
-        return index, None
+            return error
 
     def _describe_pending(self, force: bool) -> None:
         seed_size = self.options.selection.seed_size

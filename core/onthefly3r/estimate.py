@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Sequence
 
-from .backbones.features import extract_features, new_extractor
+from .backbones.features import extract_features
 from .intake.images import load_working_image
 from .options import Options
 from .records import Shot
@@ -23,12 +23,11 @@ def estimated_time_s(shots: Sequence[Shot], options: Options) -> float | None:
     if not shots or options.backbone.backbone != "classical":
         return None
     sample = shots[:: max(1, len(shots) // TIMED_PHOTOGRAPHS)][:TIMED_PHOTOGRAPHS]
-    extractor = new_extractor(options.backbone.features)
+    threads = options.backbone.threads or os.cpu_count() or 1
     began = time.perf_counter()
-    for shot in sample:
-        rgb = load_working_image(shot, options.backbone.working_px).rgb
-        extract_features(rgb, options.backbone.features, extractor)
-    features_s = (time.perf_counter() - began) / len(sample) / (options.backbone.threads or os.cpu_count() or 1)
+    images = [load_working_image(shot, options.backbone.working_px).rgb for shot in sample]
+    extract_features(images, options.backbone.features, threads=1)
+    features_s = (time.perf_counter() - began) / len(sample) / threads
     dense = min(1.0, options.backbone.dense_px / options.backbone.working_px) ** 2
     return len(shots) * features_s * (1.0 + SPARSE_FACTOR + DENSE_FACTOR * dense)
 

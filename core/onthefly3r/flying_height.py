@@ -11,12 +11,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from .backbones.features import extract_features, new_extractor
+from .backbones.features import extract_features
 from .backbones.matching import mutual_matches
 from .errors import PhotographError
 from .geometry.arrays import Float
 from .intake.images import load_working_image
-from .records import Features, Shot
+from .records import Shot
 
 MOST_PAIRS, LEAST_PAIRS = 8, 3
 WORKING_PX, FEATURES = 600, 1500
@@ -32,11 +32,10 @@ def measured_height_m(shots: Sequence[Shot], places: Mapping[int, Float]) -> flo
         shots: in capture order.
         places: positions (3,) in m by index of shot, in any level frame.
     """
-    extractor = new_extractor(FEATURES)
     heights = []
     for first, second in _pairs(shots, places):
         baseline_m = float(np.linalg.norm(places[second][:2] - places[first][:2]))
-        shift = _shift(shots[first], shots[second], extractor)
+        shift = _shift(shots[first], shots[second])
         if shift is not None and shift > LEAST_SHIFT:
             heights.append(shots[first].focal_ratio * baseline_m / shift)
     if len(heights) < LEAST_PAIRS:
@@ -57,27 +56,23 @@ def _pairs(shots: Sequence[Shot], places: Mapping[int, Float]) -> list[tuple[int
     return pairs[:: max(1, len(pairs) // MOST_PAIRS)][:MOST_PAIRS]
 
 
-def _shift(first: Shot, second: Shot, extractor: object) -> float | None:
+def _shift(first: Shot, second: Shot) -> float | None:
     """Return how far the middle of the first photograph moves in the second, in image widths (longest side)."""
     import cv2
 
     try:
-        seen = [_features(shot, extractor) for shot in (first, second)]
+        images = [load_working_image(shot, WORKING_PX).rgb for shot in (first, second)]
     except PhotographError:
         return None
-    matches = mutual_matches(seen[0][0], seen[1][0])
+    seen = extract_features(images, FEATURES, threads=2)
+    matches = mutual_matches(*seen)
     if len(matches) < LEAST_MATCHES:
         return None
-    here, there = seen[0][0].pixels[matches[:, 0]], seen[1][0].pixels[matches[:, 1]]
+    here, there = seen[0].pixels[matches[:, 0]], seen[1].pixels[matches[:, 1]]
     similarity, inliers = cv2.estimateAffinePartial2D(here, there, ransacReprojThreshold=8.0)
     if similarity is None or int(inliers.sum()) < LEAST_MATCHES // 2:
         return None
-    height_px, width_px = seen[0][1]
+    height_px, width_px = images[0].shape[:2]
     middle = np.array([width_px / 2.0, height_px / 2.0])
     moved = similarity[:, :2] @ middle + similarity[:, 2] - middle
     return float(np.linalg.norm(moved)) / max(width_px, height_px)
-
-
-def _features(shot: Shot, extractor: object) -> tuple[Features, tuple[int, int]]:
-    rgb = load_working_image(shot, WORKING_PX).rgb
-    return extract_features(rgb, FEATURES, extractor), (rgb.shape[0], rgb.shape[1])

@@ -82,9 +82,9 @@ def reconstruct(
     stopwatch = Stopwatch()
     if options.export.boundary is not None:
         read_rings(Path(options.export.boundary))  # a wrong one is told before the work, not after it
-    features = FeatureStore(out / "work" / "features", options.backbone.features)
+    features = FeatureStore(out / "work" / "features", options.backbone.features, options.backbone.threads)
     backbone = create_backbone(options.backbone, features)
-    describer = create_describer(options.selection, features.features_of, options.backbone.device)
+    describer = create_describer(options.selection, features, options.backbone.device)
     with stopwatch.stage("intake"):
         shots, refused = read_photographs(photos, options.intake)
         shots = _with_positions(shots, options)

@@ -36,9 +36,13 @@ class ClassicalBackbone:
         self._threads = options.threads or os.cpu_count() or 1
         if features is None:
             self._scratch = tempfile.TemporaryDirectory(prefix="onthefly3r-")
-            features = FeatureStore(Path(self._scratch.name), options.features)
+            features = FeatureStore(Path(self._scratch.name), options.features, options.threads)
         self._features = features
         self._matcher = PairMatcher(self._threads)
+
+    def prepare(self, images: Mapping[int, WorkingImage]) -> None:
+        """Extract the local features of new images, all at once."""
+        self._features.prepare(images)
 
     def features_of(self, index: int, image: WorkingImage) -> Features:
         """Return the local features of an image, extracted on first demand; retrieval uses the same ones."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 
@@ -13,17 +14,33 @@ WORDS = 64
 TRAINING_FEATURES = 40_000
 
 
+class LocalFeatures(Protocol):
+    """Where the local features of images come from, by shot index."""
+
+    def prepare(self, images: Mapping[int, WorkingImage]) -> None:
+        """Extract those of several images at once and keep them."""
+        ...
+
+    def features_of(self, index: int, image: WorkingImage) -> Features:
+        """Return those of one image, extracted on first demand."""
+        ...
+
+
 class VladDescriber:
     """Vector of locally aggregated descriptors (Jegou et al. 2010), codebook learnt from the first images.
 
-    `features_of` returns the cached features of an image by shot index. Residuals are L2-normalised per word
+    Residuals are L2-normalised per word
     (Arandjelovic & Zisserman 2013), then the whole vector: D = 64 * 128.
     """
 
-    def __init__(self, features_of: Callable[[int, WorkingImage], Features], seed: int = 0) -> None:
-        self.features_of = features_of
+    def __init__(self, features: LocalFeatures, seed: int = 0) -> None:
+        self.features = features
         self._seed = seed
         self._words: Float | None = None  # (WORDS, 128)
+
+    def prepare(self, images: Mapping[int, WorkingImage]) -> None:
+        """Have the local features of new images extracted, all at once."""
+        self.features.prepare(images)
 
     def fit(self, images: Mapping[int, WorkingImage]) -> None:
         """Learn the visual words from the features of the first images."""
@@ -33,7 +50,7 @@ class VladDescriber:
         per_image = max(1, TRAINING_FEATURES // max(len(images), 1))
         samples = []
         for index in images:
-            vectors = _unit(self.features_of(index, images[index]).descriptors)
+            vectors = _unit(self.features.features_of(index, images[index]).descriptors)
             samples.append(vectors[rng.permutation(len(vectors))[:per_image]])
         training = np.vstack(samples) if samples else np.zeros((0, 128), np.float32)
         if len(training) < WORDS:  # next to no texture: any words do, retrieval will find nothing either way
@@ -48,7 +65,7 @@ class VladDescriber:
         """Return the L2-normalised descriptor (8192,) float32; zeros for an image without features."""
         if self._words is None:
             raise RuntimeError("describe() before fit()")
-        vectors = _unit(self.features_of(index, image).descriptors)
+        vectors = _unit(self.features.features_of(index, image).descriptors)
         if len(vectors) == 0:
             return np.zeros(WORDS * 128, np.float32)
         # Nearest word by |v - w|^2 = 1 - 2 v.w + |w|^2.
