@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -134,21 +134,12 @@ class Engine:
         new = {len(self.shots) + i: shot for i, shot in enumerate(shots)}
         self.shots.update(new)
         threads = self.options.backbone.threads or os.cpu_count() or 1
-        with self.stopwatch.stage("features"), ThreadPoolExecutor(threads) as pool:
-            for start in range(0, len(new), READ_AT_ONCE * threads):
+        at_once = READ_AT_ONCE * threads
+        with ThreadPoolExecutor(threads) as pool:
+            for start in range(0, len(new), at_once):
                 self._checkpoint("reading photographs", start, len(new))
-                some = list(new)[start : start + READ_AT_ONCE * threads]
-                read = dict(zip(some, pool.map(self._read, some), strict=True))
-                good = {index: image for index, image in read.items() if isinstance(image, WorkingImage)}
-                for part in (self._backbone, self._describer):  # what they extract is the same, and extracted once
-                    prepare = getattr(part, "prepare", None)
-                    if prepare is not None and good:
-                        prepare(good)
-                self._pending += good
-                for index, found in read.items():
-                    if isinstance(found, PhotographError):
-                        self._reject((index,), "intake", found.reason, {})
-        self._describe_pending(force=False)
+                self._prepare(list(new)[start : start + at_once], pool)
+                self._describe_pending(force=False)  # while the images are at hand
 
     def finish(self) -> None:
         """Place what is still waiting, retry what was set aside, and remove the drift."""
@@ -159,6 +150,21 @@ class Engine:
         self._settle()
         if self.options.pose_graph.refine and self.state.frames:
             self._refine()
+
+    def _prepare(self, new: list[int], pool: Executor) -> None:
+        """Decode images, and extract what backbone and descriptor want of them, which may be the same."""
+        with self.stopwatch.stage("features"):
+            images: dict[int, WorkingImage] = {}
+            for index, found in zip(new, pool.map(self._read, new), strict=True):
+                if isinstance(found, PhotographError):
+                    self._reject((index,), "intake", found.reason, {})
+                else:
+                    images[index] = found
+            for part in (self._backbone, self._describer):
+                prepare = getattr(part, "prepare", None)
+                if prepare is not None:
+                    prepare(images)
+        self._pending += images
 
     def _read(self, index: int) -> WorkingImage | PhotographError:
         try:

@@ -75,4 +75,4 @@ def _shift(first: Shot, second: Shot) -> float | None:
     height_px, width_px = images[0].shape[:2]
     middle = np.array([width_px / 2.0, height_px / 2.0])
     moved = similarity[:, :2] @ middle + similarity[:, 2] - middle
-    return float(np.linalg.norm(moved)) / max(width_px, height_px)
+    return float(np.linalg.norm(moved) / max(width_px, height_px))

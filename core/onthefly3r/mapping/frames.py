@@ -6,21 +6,21 @@ import numpy as np
 
 from ..geometry.arrays import UInt8
 from ..records import Frame, LocalView, NewFrame, WorkingImage
-from ..registration.references import compact_reference
+from ..registration.references import compact_reference, trusted_pixels
 
 
 def new_frame(
     index: int, submap: int, view: LocalView, image: WorkingImage, min_confidence: float, reference_points: int
 ) -> NewFrame:
     """Return pose, compact reference and coloured confident points of one image, in the frame of its submap."""
-    rows, columns = np.nonzero((view.confidence >= min_confidence) & np.isfinite(view.points).all(axis=-1))
+    kept = trusted_pixels(view, min_confidence)
     rgb = colours_at_grid(view, image)
     return NewFrame(
         frame=Frame(index, submap, view.camera, view.grid_from_photo, view.local_from_cam),
         reference=compact_reference(view, reference_points, min_confidence),
-        points=view.points[rows, columns].astype(np.float32),
-        rgb=rgb[rows, columns],
-        confidence=np.rint(255.0 * view.confidence[rows, columns]).astype(np.uint8),
+        points=view.points[kept].astype(np.float32),
+        rgb=rgb[kept],
+        confidence=np.rint(255.0 * view.confidence[kept]).astype(np.uint8),
     )
 
 
@@ -29,10 +29,11 @@ def colours_at_grid(view: LocalView, image: WorkingImage) -> UInt8:
     import cv2
 
     height, width = view.confidence.shape
-    working_from_grid = image.working_from_photo.apply(
-        view.grid_from_photo.inverse().apply(view.camera.pixel_centres().reshape(-1, 2))
-    ).reshape(height, width, 2)
+    # Both maps keep the axes apart, so two pixels tell where all are.
+    two = np.array([[0.5, 0.5], [1.5, 1.5]])
     # OpenCV counts from the centre of the first pixel, we from its corner.
-    at = (working_from_grid - 0.5).astype(np.float32)
-    sampled = cv2.remap(image.rgb, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    first, second = image.working_from_photo.apply(view.grid_from_photo.inverse().apply(two)) - 0.5
+    working_from_grid = np.column_stack([np.diag(second - first), first])
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    sampled = cv2.warpAffine(image.rgb, working_from_grid, (width, height), flags=how, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(sampled, np.uint8)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..geometry.arrays import Float, Int
+from ..geometry.arrays import Bool, Float, Int
 from ..geometry.transforms import Sim3
 from ..records import CompactReference, Correspondences, LocalModel, LocalView
 
@@ -18,22 +18,27 @@ MAX_PAIRS_PER_REFERENCE = 500
 def compact_reference(view: LocalView, max_points: int, min_confidence: float) -> CompactReference:
     """Return H_i (Eq. 2): the most confident points of each cell of a regular image grid, the same number per cell."""
     height, width = view.confidence.shape
-    rows, columns = np.nonzero((view.confidence >= min_confidence) & np.isfinite(view.points).all(axis=-1))
-    confidence = view.confidence[rows, columns]
     cell_px = max(1, -(-width // CELLS_ACROSS))
     cells_down = -(-height // cell_px)
-    cell = (rows // cell_px) * CELLS_ACROSS + columns // cell_px
     per_cell = max(1, max_points // (CELLS_ACROSS * cells_down))
-    order = np.lexsort((-confidence, cell))  # by cell, most confident first
-    sorted_cell = cell[order]
-    first_of_cell = np.searchsorted(sorted_cell, sorted_cell, side="left")
-    kept = order[np.arange(len(order)) - first_of_cell < per_cell]
-    rows, columns = rows[kept], columns[kept]
+    ranked = np.full((cells_down * cell_px, CELLS_ACROSS * cell_px), -np.inf, np.float32)
+    ranked[:height, :width] = np.where(trusted_pixels(view, min_confidence), view.confidence, -np.inf)
+    cells = ranked.reshape(cells_down, cell_px, CELLS_ACROSS, cell_px).swapaxes(1, 2).reshape(-1, cell_px**2)
+    best = np.argpartition(-cells, min(per_cell, cell_px**2) - 1, axis=1)[:, :per_cell]
+    cell, place = np.nonzero(np.isfinite(np.take_along_axis(cells, best, axis=1)))
+    pixel = best[cell, place]
+    rows, columns = cell // CELLS_ACROSS * cell_px + pixel // cell_px, cell % CELLS_ACROSS * cell_px + pixel % cell_px
     return CompactReference(
         pixels=np.column_stack([columns, rows]).astype(np.int32),
         points=view.points[rows, columns].astype(np.float32),
         confidence=view.confidence[rows, columns].astype(np.float32),
     )
+
+
+def trusted_pixels(view: LocalView, min_confidence: float) -> Bool:
+    """Return the pixels (H, W) of a point map that hold a point of at least this confidence."""
+    x, y, z = np.moveaxis(view.points, -1, 0)
+    return np.asarray((view.confidence >= min_confidence) & np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
 
 
 def correspond(
