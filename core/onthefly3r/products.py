@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -129,6 +130,7 @@ def _write_cloud(
         work / "fusion",
         options.export.stray_filter,
         lambda done, total: checkpoint("fusing the cloud", done, total),
+        options.backbone.threads or os.cpu_count() or 1,
     )
     # Fused before it is projected: a fifth of the points are left then.
     tiles: Iterator[CloudTile] = (replace(tile, points=frame.from_level(tile.points)) for tile in fused)

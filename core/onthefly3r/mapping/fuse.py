@@ -7,7 +7,9 @@ decided on the same points from both sides, and each voxel is written by the one
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -20,7 +22,8 @@ from ..records import CloudTile
 from .spill import Spill, Tile, voxel_index
 
 TILE_VOXELS = 256  # side of a tile
-MAX_SQUARE_POINTS = 2_000_000  # a square with more input points is fused in quarters,
+MAX_TILES_AT_ONCE = 4  # each thread works on one
+MAX_SQUARE_POINTS = 1_000_000  # a square with more input points is fused in quarters,
 MIN_SQUARE_VOXELS = 8  # down to this side
 # A voxel is stray with fewer occupied voxels than this among the 124 around it (5 x 5 x 5): a smooth surface has
 # about 24 of them, its corner 8. Where the points lie further apart than the voxels, the reach grows with them.
@@ -38,6 +41,7 @@ def fuse(
     work: Path,
     stray_filter: bool,
     progress: FuseProgress | None = None,
+    threads: int = 1,
 ) -> Iterator[CloudTile]:
     """Yield the fused cloud of overlapping batches tile by tile, one point per occupied voxel.
 
@@ -53,6 +57,7 @@ def fuse(
         work: folder for temporary files (40 bytes a point), removed from it at the end.
         stray_filter: drop voxels with fewer than `MIN_NEIGHBOURS` occupied ones around them.
         progress: called after each tile; an exception it raises stops the fusion.
+        threads: of the processor; at most `MAX_TILES_AT_ONCE` are used.
 
     Raises:
         ValueError: spacing_m is not positive.
@@ -68,15 +73,31 @@ def fuse(
         for batch in chain([first], batches):
             spill.add(batch)
         spill.flush()
+        spill.settle()
         tiles = spill.tiles()
-        for done, tile in enumerate(tiles, start=1):
+
+        def fused(tile: Tile) -> list[CloudTile]:
             corner = (tile[0] * TILE_VOXELS, tile[1] * TILE_VOXELS)
-            for square in _squares(spill, tile, corner, TILE_VOXELS, reach):
-                fused = _fuse_square(square, spacing_m, min_confidence, reach)
-                if len(fused.points):
-                    yield fused
+            squares = _squares(spill, tile, corner, TILE_VOXELS, reach)
+            return [_fuse_square(square, spacing_m, min_confidence, reach) for square in squares]
+
+        for done, parts in enumerate(_mapped(fused, tiles, min(threads, MAX_TILES_AT_ONCE)), start=1):
+            yield from (part for part in parts if len(part.points))
             if progress is not None:
                 progress(done, len(tiles))
+
+
+def _mapped(
+    function: Callable[[Tile], list[CloudTile]], tiles: Sequence[Tile], threads: int
+) -> Iterator[list[CloudTile]]:
+    """Yield the results in order; only so many as there are threads are made ahead, for the sake of memory."""
+    with ThreadPoolExecutor(threads) as pool:
+        ahead = deque(pool.submit(function, tile) for tile in tiles[:threads])
+        for following in [*tiles[threads:], *[None] * len(ahead)]:
+            result = ahead.popleft().result()
+            if following is not None:
+                ahead.append(pool.submit(function, following))
+            yield result
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ that a few blunders scatter about.
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
 
@@ -30,6 +31,7 @@ BUFFER_POINTS = 1_000_000
 MAX_REACH_VOXELS = 2**27  # points further from the first batch are blunders and left out
 
 Tile = tuple[int, int]  # column, row; tile (0, 0) begins at the origin of the export frame
+_Run = tuple[Path, dict[int, tuple[int, int]]]  # file, packed tile -> (first, count)
 
 
 def voxel_index(positions: Float, spacing_m: float) -> Int:
@@ -46,7 +48,9 @@ class Spill:
         self._tile_voxels, self._halo_voxels = tile_voxels, halo_voxels
         self._buffer: list[tuple[Int, np.ndarray]] = []  # (packed tile, points)
         self._buffered = 0
-        self._runs: list[tuple[Path, dict[int, tuple[int, int]]]] = []  # file, packed tile -> (first, count)
+        self._runs: list[_Run] = []
+        self._writer = ThreadPoolExecutor(1)
+        self._writing: Future[_Run] | None = None
         self._centre: Float | None = None  # (3,) m, median of the first batch
         self._owned: set[int] = set()  # packed tiles with points of their own, not only of the halo
 
@@ -59,9 +63,9 @@ class Spill:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._buffer.clear()
-        for path, _ in self._runs:
-            path.unlink(missing_ok=True)
+        self._writer.shutdown()
+        for written in self._work.glob("spill-*.bin"):
+            written.unlink()
 
     def add(self, batch: CloudTile) -> None:
         """Add the points of a batch; those that are not finite, without confidence or absurdly far are left out."""
@@ -88,21 +92,19 @@ class Spill:
             self.flush()
 
     def flush(self) -> None:
-        """Write what is buffered as one file ordered by tile."""
+        """Have what is buffered written as one file ordered by tile, while more is collected."""
+        self.settle()  # one file at a time: two would double what the buffer holds
         if not self._buffered:
             return
-        keys = np.concatenate([key for key, _ in self._buffer])
-        points = np.concatenate([part for _, part in self._buffer])
-        self._buffer.clear()
-        self._buffered = 0
-        order = np.argsort(keys, kind="stable")
-        keys = keys[order]
-        first = np.flatnonzero(np.diff(keys, prepend=keys[0] - 1))
-        count = np.diff(first, append=len(keys))
         path = self._work / f"spill-{len(self._runs):06d}.bin"
-        index = {int(t): (int(f), int(c)) for t, f, c in zip(keys[first], first, count, strict=True)}
-        self._runs.append((path, index))
-        np.take(points, order).tofile(path)
+        self._writing = self._writer.submit(_write_run, path, self._buffer)
+        self._buffer, self._buffered = [], 0
+
+    def settle(self) -> None:
+        """Wait for the file that is being written; raises what went wrong with it."""
+        if self._writing is not None:
+            writing, self._writing = self._writing, None
+            self._runs.append(writing.result())
 
     def tiles(self) -> list[Tile]:
         """Return the tiles that own points, row by row."""
@@ -146,6 +148,17 @@ class Spill:
     def _append(self, tile: Int, points: np.ndarray) -> None:
         self._buffer.append((tile, points))
         self._buffered += len(points)
+
+
+def _write_run(path: Path, parts: list[tuple[Int, np.ndarray]]) -> _Run:
+    keys = np.concatenate([key for key, _ in parts])
+    points = np.concatenate([part for _, part in parts])
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    first = np.flatnonzero(np.diff(keys, prepend=keys[0] - 1))
+    count = np.diff(first, append=len(keys))
+    np.take(points, order).tofile(path)
+    return path, {int(t): (int(f), int(c)) for t, f, c in zip(keys[first], first, count, strict=True)}
 
 
 def _pack(column: Int, row: Int) -> Int:
