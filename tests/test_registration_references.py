@@ -37,6 +37,20 @@ def test_points_are_spread_over_the_grid_with_the_most_confident_of_each_cell() 
         np.testing.assert_array_equal(np.sort(reference.confidence[cell == one])[::-1], expected)
 
 
+def test_points_that_recur_come_before_more_confident_ones() -> None:
+    rng = np.random.default_rng(1)
+    confidence = rng.uniform(0.4, 1.0, (42, 56)).astype(np.float32)
+    recurring = rng.random((42, 56)) < 0.05
+    view = replace(true_view(0), confidence=confidence, recurring=recurring)
+    columns, rows = compact_reference(view, 600, 0.5).pixels.T
+    kept = np.zeros_like(recurring)
+    kept[rows, columns] = True
+    assert (confidence[kept] >= 0.5).all()
+    usable = recurring & (confidence >= 0.5)
+    assert kept[usable].mean() > 0.95  # a cell may have more of them than it may keep
+    np.testing.assert_array_equal(compact_reference(view, 600, 0.5).confidence, confidence[rows, columns])
+
+
 def test_points_and_confidences_belong_to_their_pixels() -> None:
     view = true_view(3)
     reference = compact_reference(view, 500, 0.5)

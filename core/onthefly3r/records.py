@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from .geometry.arrays import Float, Int, UInt8
+from .geometry.arrays import Bool, Float, Int, UInt8
 from .geometry.camera import Camera, PixelMap
 from .geometry.transforms import Rigid3, Sim3
 
@@ -129,6 +129,8 @@ class LocalView:
     points: Float  # (H, W, 3) float32, local frame; NaN where nothing is known
     confidence: Float  # (H, W) float32 in 0..1; 0 where points are NaN
     tokens: Float | None = None  # (D,) context token of a neural backbone
+    # (H, W) pixels that hold a point in every local model that places the image; None where all pixels do.
+    recurring: Bool | None = None
 
 
 @dataclass(frozen=True)

@@ -105,6 +105,7 @@ class ClassicalBackbone:
                 local_from_cam=placed[index],
                 points=found.points,
                 confidence=found.confidence,
+                recurring=found.sparse,  # keypoints are triangulated anew, references get no stereo
             )
         calibrated = {
             keys[i]: model.cameras[keys[i]].resized(images[i].shot.width_px, images[i].shot.height_px)

@@ -89,6 +89,7 @@ def dense_views(
         views[i] = DenseView(
             np.where(chosen[..., None], sparse.points, dense.points),
             np.where(chosen, sparse.confidence, dense.confidence),
+            chosen,
         )
     return views
 
@@ -268,4 +269,4 @@ def _to_view(index: int, depth_map: _DepthMap, model: SparseModel, keys: Mapping
     known = np.isfinite(depth_map.depth)
     precision = precision_worth(depth_map.sigma, depth_map.depth, model.cameras[keys[index]].fx)
     confidence = np.where(known, precision * depth_map.trust, 0.0).astype(np.float32)
-    return DenseView(_points(index, depth_map, model, keys), confidence)
+    return DenseView(_points(index, depth_map, model, keys), confidence, np.zeros(known.shape, bool))

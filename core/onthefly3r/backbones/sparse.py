@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry.arrays import Float, Int
+from ..geometry.arrays import Bool, Float, Int
 from ..records import Features
 from .local_sfm import SparseModel
 
@@ -25,6 +25,7 @@ class DenseView:
 
     points: Float  # (H, W, 3) float32, local frame; NaN where nothing is known
     confidence: Float  # (H, W) float32 in 0..1; 0 where points are NaN
+    sparse: Bool  # (H, W) where the point is a sparse one
 
 
 def sparse_view(
@@ -40,7 +41,7 @@ def sparse_view(
     confidence = np.zeros((height, width), np.float32)
     track = model.tracks[index]
     if len(track.features) == 0:
-        return DenseView(points, confidence)
+        return DenseView(points, confidence, confidence > 0.0)
     working = model.cameras[keys[index]]
     camera = working.resized(width, height)
     places = features.pixels[track.features].astype(float) * (width / working.width, height / working.height)
@@ -52,7 +53,7 @@ def sparse_view(
     columns, rows = cells[good].T
     points[rows, columns] = model.points[track.points[good]]
     confidence[rows, columns] = _confidence(index, model, keys)[good]
-    return DenseView(points, confidence)
+    return DenseView(points, confidence, confidence > 0.0)
 
 
 def ray_angles(index: int, other: int, model: SparseModel, points: Int) -> Float:

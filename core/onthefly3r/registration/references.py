@@ -16,13 +16,17 @@ MAX_PAIRS_PER_REFERENCE = 500
 
 
 def compact_reference(view: LocalView, max_points: int, min_confidence: float) -> CompactReference:
-    """Return H_i (Eq. 2): the most confident points of each cell of a regular image grid, the same number per cell."""
+    """Return H_i (Eq. 2): the most confident points of each cell of a regular image grid, the same number per cell.
+
+    Points that later models of the image will hold too come first: the others would find nothing to correspond to.
+    """
     height, width = view.confidence.shape
     cell_px = max(1, -(-width // CELLS_ACROSS))
     cells_down = -(-height // cell_px)
     per_cell = max(1, max_points // (CELLS_ACROSS * cells_down))
     ranked = np.full((cells_down * cell_px, CELLS_ACROSS * cell_px), -np.inf, np.float32)
-    ranked[:height, :width] = np.where(trusted_pixels(view, min_confidence), view.confidence, -np.inf)
+    rank = view.confidence if view.recurring is None else view.confidence + view.recurring
+    ranked[:height, :width] = np.where(trusted_pixels(view, min_confidence), rank, -np.inf)
     cells = ranked.reshape(cells_down, cell_px, CELLS_ACROSS, cell_px).swapaxes(1, 2).reshape(-1, cell_px**2)
     best = np.argpartition(-cells, min(per_cell, cell_px**2) - 1, axis=1)[:, :per_cell]
     cell, place = np.nonzero(np.isfinite(np.take_along_axis(cells, best, axis=1)))
