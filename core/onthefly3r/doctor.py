@@ -49,6 +49,7 @@ PACKAGES = (
     Package("pyshp", "shapefile"),
     Package("pillow", "PIL"),
     Package("defusedxml", "defusedxml"),
+    Package("threadpoolctl", "threadpoolctl"),
     Package("trimesh", "trimesh"),
     Package("embreex", "embreex"),
     Package("typer", "typer"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -99,8 +100,9 @@ def reconstruct(
         cancel,
     )
     engine.stopwatch = stopwatch
-    engine.add_all(shots)
-    engine.finish()
+    with single_threaded_blas():
+        engine.add_all(shots)
+        engine.finish()
     shutil.rmtree(work / "features", ignore_errors=True)
     write_text(work / "run.json", json.dumps(_run_to_json(engine, backbone.spec.facts(), refused), ensure_ascii=False))
     outcome = _Outcome(
@@ -114,6 +116,18 @@ def reconstruct(
         engine.warnings,
     )
     return _finish(out, work, engine.state, engine.store, outcome, options, stopwatch, progress, cancel)
+
+
+def single_threaded_blas() -> AbstractContextManager[object]:
+    """Keep the linear algebra below numpy and scipy to one thread for a while.
+
+    Images and pairs are worked on in several threads already: with more below them, they wait for each other.
+    """
+    import scipy.linalg  # noqa: F401 - only libraries that are loaded are found
+    from threadpoolctl import threadpool_limits
+
+    limits: AbstractContextManager[object] = threadpool_limits(limits=1, user_api="blas")
+    return limits
 
 
 def export_again(
