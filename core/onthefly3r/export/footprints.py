@@ -36,7 +36,7 @@ class Footprint:
     @property
     def area_m2(self) -> float:
         """The area of the outline (shoelace formula)."""
-        x, y = self.outline.T
+        x, y = (self.outline - self.centre).T  # projected coordinates are large, and their products lose digits
         return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2.0)
 
 
