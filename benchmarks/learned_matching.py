@@ -45,7 +45,7 @@ class XFeatStore:
         self._known: dict[int, Features] = {}
         self._lock = threading.Lock()
 
-    def prepare(self, images: Mapping[int, WorkingImage]) -> None:
+    def extract(self, images: Mapping[int, WorkingImage]) -> None:
         """Extract the features of new images."""
         for index, image in images.items():
             self.features_of(index, image)

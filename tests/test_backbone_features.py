@@ -57,7 +57,7 @@ def test_images_of_several_sizes_are_extracted_together_as_they_are_alone(tmp_pa
     rgb = {3: blocks(3), 5: blocks(5, 200, 300), 8: CHECKED, 9: blocks(9)}
     images = {i: WorkingImage(None, pixels, PixelMap(1.0, 1.0)) for i, pixels in rgb.items()}  # type: ignore[arg-type]
     store = FeatureStore(tmp_path / "Flug süd", 400, threads=2)
-    store.prepare(images)
+    store.extract(images)
     for index, image in images.items():
         (alone,) = extract_features([image.rgb], 400, threads=1)
         assert same(store.load(index), alone)
@@ -70,5 +70,5 @@ def test_features_that_are_there_are_not_extracted_again(tmp_path: Path) -> None
     first = store.features_of(0, image)
     other = WorkingImage(None, blocks(4), PixelMap(1.0, 1.0))  # type: ignore[arg-type]
     assert same(store.features_of(0, other), first)
-    store.prepare({0: other})
+    store.extract({0: other})
     assert same(store.load(0), first)

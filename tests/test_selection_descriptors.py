@@ -28,7 +28,7 @@ class Known:
 
     of: dict[int, Features]
 
-    def prepare(self, images: Mapping[int, WorkingImage]) -> None:
+    def extract(self, images: Mapping[int, WorkingImage]) -> None:
         raise AssertionError("they are there")
 
     def features_of(self, index: int, image: WorkingImage) -> Features:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from onthefly3r.backbones.base import Backbone, BackboneSpec
+from onthefly3r.backbones.base import Backbone, BackboneSpec, ExtractsFeatures
 from onthefly3r.engine import Engine
 from onthefly3r.geometry.camera import Camera
 from onthefly3r.geometry.transforms import Rigid3
@@ -72,9 +72,8 @@ class Counting:
     def __init__(self, inner: Backbone) -> None:
         self._inner = inner
         self.sizes: list[int] = []
-        prepare = getattr(inner, "prepare", None)
-        if prepare is not None:
-            self.prepare = prepare
+        if isinstance(inner, ExtractsFeatures):
+            self.extract_features = inner.extract_features
 
     @property
     def spec(self) -> BackboneSpec:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .backbones.base import Backbone
+from .backbones.base import Backbone, ExtractsFeatures
 from .errors import Cancelled, PhotographError
 from .geometry.arrays import Float
 from .geometry.transforms import Sim3
@@ -161,9 +161,8 @@ class Engine:
                 else:
                     images[index] = found
             for part in (self._backbone, self._describer):
-                prepare = getattr(part, "prepare", None)
-                if prepare is not None:
-                    prepare(images)
+                if isinstance(part, ExtractsFeatures):
+                    part.extract_features(images)
         self._pending += images
 
     def _read(self, index: int) -> WorkingImage | PhotographError:

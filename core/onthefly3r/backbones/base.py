@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from ..geometry.camera import Camera
 from ..networks.weights import Fingerprint
@@ -26,6 +26,15 @@ class BackboneSpec:
         """Return what the report says of the backbone, JSON values."""
         weights = None if self.weights is None else asdict(self.weights)
         return {"name": self.name, "version": self.version, "licence": self.licence, "weights": weights}
+
+
+@runtime_checkable
+class ExtractsFeatures(Protocol):
+    """A backbone or descriptor that works on local features, which several photographs at once give faster."""
+
+    def extract_features(self, images: Mapping[int, WorkingImage]) -> None:
+        """Extract and keep the features of new images, by shot index."""
+        ...
 
 
 class Backbone(Protocol):

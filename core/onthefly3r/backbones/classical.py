@@ -40,9 +40,9 @@ class ClassicalBackbone:
         self._features = features
         self._matcher = PairMatcher(self._threads)
 
-    def prepare(self, images: Mapping[int, WorkingImage]) -> None:
+    def extract_features(self, images: Mapping[int, WorkingImage]) -> None:
         """Extract the local features of new images, all at once."""
-        self._features.prepare(images)
+        self._features.extract(images)
 
     def features_of(self, index: int, image: WorkingImage) -> Features:
         """Return the local features of an image, extracted on first demand; retrieval uses the same ones."""

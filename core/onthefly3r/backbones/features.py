@@ -90,7 +90,7 @@ class FeatureStore:
         self._recent: OrderedDict[int, Features] = OrderedDict()
         self._lock = threading.Lock()
 
-    def prepare(self, images: Mapping[int, WorkingImage]) -> None:
+    def extract(self, images: Mapping[int, WorkingImage]) -> None:
         """Extract the features of several images at once, those that are not on disk yet."""
         missing = [index for index in images if not self._path(index).exists()]
         if not missing:
@@ -105,7 +105,7 @@ class FeatureStore:
         try:
             return self.load(index)
         except KeyError:
-            self.prepare({index: image})
+            self.extract({index: image})
             return self.load(index)
 
     def load(self, index: int) -> Features:

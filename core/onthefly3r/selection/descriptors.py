@@ -17,7 +17,7 @@ TRAINING_FEATURES = 40_000
 class LocalFeatures(Protocol):
     """Where the local features of images come from, by shot index."""
 
-    def prepare(self, images: Mapping[int, WorkingImage]) -> None:
+    def extract(self, images: Mapping[int, WorkingImage]) -> None:
         """Extract those of several images at once and keep them."""
         ...
 
@@ -38,9 +38,9 @@ class VladDescriber:
         self._seed = seed
         self._words: Float | None = None  # (WORDS, 128)
 
-    def prepare(self, images: Mapping[int, WorkingImage]) -> None:
+    def extract_features(self, images: Mapping[int, WorkingImage]) -> None:
         """Have the local features of new images extracted, all at once."""
-        self.features.prepare(images)
+        self.features.extract(images)
 
     def fit(self, images: Mapping[int, WorkingImage]) -> None:
         """Learn the visual words from the features of the first images."""
