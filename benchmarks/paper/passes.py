@@ -23,12 +23,15 @@ def graph_passes(store: Store) -> tuple[GraphPass, ...]:
     """Replay a journal; raises `InputError` when it is damaged."""
     frames: dict[int, Frame] = {}
     map_from_submap: dict[int, Sim3] = {}
+    settled: dict[int, Sim3] = {}  # frames that do not follow their submap
     moved: dict[int, Rigid3] = {}
     passes = []
 
     def cameras() -> dict[int, Rigid3]:
         return {
-            i: moved[i] if i in moved else map_from_submap[f.submap].apply_to_pose(f.submap_from_cam)
+            i: moved[i]
+            if i in moved
+            else (settled.get(i) or map_from_submap[f.submap]).apply_to_pose(f.submap_from_cam)
             for i, f in frames.items()
         }
 
@@ -37,10 +40,11 @@ def graph_passes(store: Store) -> tuple[GraphPass, ...]:
             submap = submap_from_json(value)
             map_from_submap[submap.number] = submap.map_from_submap
             frames.update({frame.index: frame for frame in submap.frames})
-        elif kind in ("submap_poses", "frame_poses"):
+        elif kind in ("settled", "frame_poses"):
             before = cameras()
-            if kind == "submap_poses":
-                map_from_submap.update({int(k): sim3_from_json(v) for k, v in value.items()})
+            if kind == "settled":
+                map_from_submap.update({int(k): sim3_from_json(v) for k, v in value["submaps"].items()})
+                settled.update({int(k): sim3_from_json(v) for k, v in value["frames"].items()})
             else:
                 moved.update({int(k): rigid3_from_json(v) for k, v in value.items()})
             passes.append(GraphPass(before, cameras()))

@@ -114,7 +114,7 @@ class Engine:
         """Return figures of the run for the report."""
         return {
             "submaps": float(len(self.state.map_from_submap)),
-            "edges": float(len(self.state.edges)),
+            "sightings": float(len(self.state.sightings)),
             "backbone_calls": float(self.backbone_calls),
             "mean_batch": sum(self.batch_sizes) / len(self.batch_sizes) if self.batch_sizes else 0.0,
             "pruned_references": float(self.pruned_references),
@@ -272,7 +272,7 @@ class Engine:
             similar = self._index.top(outcome.accepted, self.options.selection.references)
             retrieved = {index: [n.index for n in found] for index, found in similar.items()}
             extra = frame_edges(model, outcome, retrieved, self.state)
-        submap = Submap(number, outcome.alignment.map_from_local, (), outcome.edges, extra)
+        submap = Submap(number, outcome.alignment.map_from_local, (), outcome.sightings, extra)
         self.batch_sizes.append(len(outcome.accepted))
         self._commit(model, submap, outcome.accepted)
         for refused in outcome.refused:

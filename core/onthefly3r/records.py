@@ -1,7 +1,7 @@
 """What the stages hand to each other: frozen records, array fields with shape, frame and unit.
 
 GpsFix, Attitude -> Shot -> WorkingImage -> Features -> Descriptor
--> Subset -> LocalModel -> Correspondences -> Alignment | Rejection -> Submap, Edge -> GeoReference
+-> Subset -> LocalModel -> Correspondences -> Alignment | Rejection -> Submap, Sighting -> GeoReference
 """
 
 from __future__ import annotations
@@ -210,12 +210,22 @@ class Frame:
 
 @dataclass(frozen=True)
 class Edge:
-    """A measured Sim(3) between two submaps."""
+    """A measured Sim(3) between two nodes of a pose graph."""
 
-    source: int  # submap
-    target: int  # submap
+    source: int
+    target: int
     source_from_target: Sim3
     covariance: Float  # (7, 7) [rotation rad, translation, log scale], right perturbation in the target frame
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A placed frame as a later submap saw it again: the references of a subset are inferred anew."""
+
+    frame: int  # shot index
+    submap: int  # that saw it again
+    frame_from_submap: Sim3  # to the frame in which the points of `frame` are stored, that of its own submap
+    submap_from_cam: Rigid3
 
 
 @dataclass(frozen=True)
@@ -243,12 +253,12 @@ class NewFrame:
 
 @dataclass(frozen=True)
 class Submap:
-    """One committed local model: its new frames, and its edges to the submaps of its references."""
+    """One committed local model: its new frames, and how it saw its references."""
 
     number: int
     map_from_submap: Sim3
     frames: tuple[Frame, ...]
-    edges: tuple[Edge, ...]
+    sightings: tuple[Sighting, ...]
     frame_edges: tuple[FrameEdge, ...] = ()
     calibrations: Mapping[str, Camera] = field(default_factory=dict)  # first seen here; per camera key, photograph size
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..geometry.camera import Camera, PixelMap
 from ..geometry.transforms import Rigid3, Sim3
-from ..records import Attitude, Edge, Frame, FrameEdge, GpsFix, Shot, Submap
+from ..records import Attitude, Frame, FrameEdge, GpsFix, Shot, Sighting, Submap
 
 
 def sim3_to_json(transform: Sim3) -> dict[str, Any]:
@@ -59,14 +59,14 @@ def submap_to_json(submap: Submap) -> dict[str, Any]:
             }
             for frame in submap.frames
         ],
-        "edges": [
+        "sightings": [
             {
-                "source": edge.source,
-                "target": edge.target,
-                "source_from_target": sim3_to_json(edge.source_from_target),
-                "covariance": edge.covariance.tolist(),
+                "frame": seen.frame,
+                "submap": seen.submap,
+                "frame_from_submap": sim3_to_json(seen.frame_from_submap),
+                "submap_from_cam": rigid3_to_json(seen.submap_from_cam),
             }
-            for edge in submap.edges
+            for seen in submap.sightings
         ],
         "frame_edges": [
             {**asdict(edge), "source_from_target": rigid3_to_json(edge.source_from_target)}
@@ -88,14 +88,14 @@ def submap_from_json(value: Any) -> Submap:
         )
         for f in value["frames"]
     )
-    edges = tuple(
-        Edge(
-            int(e["source"]),
-            int(e["target"]),
-            sim3_from_json(e["source_from_target"]),
-            np.array(e["covariance"], float),
+    sightings = tuple(
+        Sighting(
+            int(s["frame"]),
+            int(s["submap"]),
+            sim3_from_json(s["frame_from_submap"]),
+            rigid3_from_json(s["submap_from_cam"]),
         )
-        for e in value["edges"]
+        for s in value["sightings"]
     )
     frame_edges = tuple(
         FrameEdge(
@@ -110,7 +110,7 @@ def submap_from_json(value: Any) -> Submap:
     )
     calibrations = {str(key): camera_from_json(camera) for key, camera in value["calibrations"].items()}
     pose = sim3_from_json(value["map_from_submap"])
-    return Submap(int(value["number"]), pose, frames, edges, frame_edges, calibrations)
+    return Submap(int(value["number"]), pose, frames, sightings, frame_edges, calibrations)
 
 
 def shot_to_json(shot: Shot) -> dict[str, Any]:

@@ -1,4 +1,8 @@
-"""Pose graph optimisation (Eq. 15-16): Sim(3) between submaps by default, the paper's SE(3) between frames as preset.
+"""Pose graph optimisation (Eq. 15-16): Sim(3) of submaps and frames by default, the paper's SE(3) graph as preset.
+
+Nodes are the submaps and those frames that more than one submap saw. An edge joins a frame to each submap that saw it,
+the one that predicted it and those that it was a reference for: the errors of views are independent, whereas relative
+poses of submaps that share a reference err together.
 
 The solver sits behind `PoseGraphSolver`, because gtsam has no wheels for Windows.
 """
@@ -6,21 +10,26 @@ The solver sits behind `PoseGraphSolver`, because gtsam has no wheels for Window
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from ..errors import MissingDependencyError
 from ..geometry.arrays import Float
-from ..geometry.transforms import Rigid3, Sim3, rotation_log
-from ..records import Edge, FrameEdge
+from ..geometry.transforms import Rigid3, Sim3, rotation_log, skew
+from ..records import Edge, FrameEdge, Sighting
 from .state import MapState
 
 HUBER = 1.345  # whitened units
 MAX_ITERATIONS = 30
 MEDIAN_MISFIT = 6.35  # of a chi-squared variable of seven degrees of freedom
 OUTLYING_PRIOR = 50.0  # times the usual squared misfit
+ROUNDS = 2  # of solving the graph with the noise that the misfits show
+FRAMES = 2**32  # nodes of frames are numbered from here, those of submaps from 0
+# Median of the mean square of three standard normal variables, and of the square of one.
+MEDIAN_OF_THREE, MEDIAN_OF_ONE = 0.789, 0.455
+LEAST_NOISE = 1e-6  # rad, spacings, of the logarithm of scale: rounding is no measure of anything
 
 
 @dataclass(frozen=True)
@@ -32,13 +41,22 @@ class PosePrior:
     information: Float  # (7, 7) of [rotation rad, translation, log scale], right perturbation; may be singular
 
 
+@dataclass(frozen=True)
+class ViewNoise:
+    """Standard deviations, per axis, of a view within its local model."""
+
+    rotation_rad: float
+    position: float  # of the camera, map units
+    log_scale: float
+
+
 class PoseGraphSolver(Protocol):
     """Robust least squares over poses."""
 
     def solve_sim3(
         self, nodes: Mapping[int, Sim3], edges: Sequence[Edge], priors: Sequence[PosePrior], fixed: int
     ) -> dict[int, Sim3]:
-        """Return optimised map_from_submap of all nodes; without priors the node `fixed` keeps its pose."""
+        """Return optimised poses of all nodes; without priors the node `fixed` keeps its pose."""
         ...
 
     def solve_se3(self, nodes: Mapping[int, Rigid3], edges: Sequence[FrameEdge], fixed: int) -> dict[int, Rigid3]:
@@ -61,22 +79,94 @@ def default_solver() -> PoseGraphSolver:
 
 
 def optimise_submaps(state: MapState, solver: PoseGraphSolver, priors: Sequence[PosePrior] = ()) -> float:
-    """Move the submaps to agree with all edges and priors (Eq. 16 on Sim(3)); return the largest shift in spacings.
+    """Move submaps and frames to agree with all sightings and priors (Eq. 16 on Sim(3)); return the largest shift.
 
-    Priors that contradict their neighbours are left out. Once the map has settled, the edges' covariances grow to the
-    misfits that are left, and it settles once more: local models that all bend alike contradict each other more than
-    their points show.
+    A frame that several submaps saw goes to the mean of what they say, others follow their submap. How well a view is
+    known within its local model is not assumed: it is what the misfits show, first as the map is and then as it has
+    settled. Priors that contradict their neighbours are left out. The shift is in spacings.
     """
-    priors = consistent_priors(priors, state.edges)
-    if not priors and not has_loops(len(state.map_from_submap), state.edges):
+    sightings = shared_sightings(state)
+    if not sightings:
         return 0.0
+    nodes = dict(state.map_from_submap)
+    nodes |= {FRAMES + seen.frame: state.submap_pose_of(seen.frame) for seen in sightings}
     before = {index: state.map_from_cam(index).translation for index in state.frames}
-    solved = solver.solve_sim3(state.map_from_submap, state.edges, priors, fixed=0)
-    if priors:
-        solved = solver.solve_sim3(solved, honest_edges(solved, state.edges), priors, fixed=0)
-    state.move_submaps(solved)
+    solved = nodes
+    for _ in range(ROUNDS):
+        noise = view_noise(solved, sightings, LEAST_NOISE * state.spacing)
+        edges = [view_edge(seen, state.map_from_submap[seen.submap].scale, noise) for seen in sightings]
+        known = consistent_priors(priors, submap_edges(state, noise))
+        solved = solver.solve_sim3(solved, edges, known, fixed=0)
+    state.move_submaps(
+        {node: pose for node, pose in solved.items() if node < FRAMES},
+        {node - FRAMES: pose for node, pose in solved.items() if node >= FRAMES},
+    )
     shift = max(float(np.abs(state.map_from_cam(i).translation - before[i]).max()) for i in before)
     return shift / state.spacing
+
+
+def shared_sightings(state: MapState) -> list[Sighting]:
+    """Return all sightings of the frames that more than one submap saw, that by their own submap among them."""
+    own = {seen.frame: state.frames[seen.frame] for seen in state.sightings}
+    first = [Sighting(i, frame.submap, Sim3(), frame.submap_from_cam) for i, frame in own.items()]
+    return first + state.sightings
+
+
+def view_noise(nodes: Mapping[int, Sim3], sightings: Sequence[Sighting], least_position: float) -> ViewNoise:
+    """Return what the misfits of the sightings at given poses show of the noise of one view.
+
+    Medians, so that views placed wrong do not count. Where frames and submaps follow few sightings, these fit better
+    than they are good: the unknowns' share is added.
+    """
+    steps = np.array([_misfit_at_camera(nodes, seen) for seen in sightings])
+    fitted = len({seen.frame for seen in sightings}) + len({seen.submap for seen in sightings}) - 1
+    grow = np.sqrt(len(sightings) / max(len(sightings) - fitted, 1))
+    rotation, position = (np.sqrt(np.median((steps[:, k : k + 3] ** 2).mean(axis=1)) / MEDIAN_OF_THREE) for k in (0, 3))
+    log_scale = np.sqrt(np.median(steps[:, 6] ** 2) / MEDIAN_OF_ONE)
+    return ViewNoise(
+        rotation_rad=max(float(grow * rotation), LEAST_NOISE),
+        position=max(float(grow * position), least_position),
+        log_scale=max(float(grow * log_scale), LEAST_NOISE),
+    )
+
+
+def _misfit_at_camera(nodes: Mapping[int, Sim3], seen: Sighting) -> Float:
+    """Return [rotation rad, position in map units, log scale] (7,) by which a submap's view misses the frame."""
+    submap = nodes[seen.submap]
+    frame_from_submap = nodes[FRAMES + seen.frame].inverse() @ submap
+    centre = Sim3(1.0, np.eye(3), seen.submap_from_cam.translation)
+    step = tangent(centre.inverse() @ seen.frame_from_submap.inverse() @ frame_from_submap @ centre)
+    step[3:6] *= submap.scale
+    return step
+
+
+def view_edge(seen: Sighting, scale: float, noise: ViewNoise) -> Edge:
+    """Return the edge from a frame to a submap that saw it; `scale` is that of the submap in the map."""
+    return Edge(FRAMES + seen.frame, seen.submap, seen.frame_from_submap, _view_covariance(seen, scale, noise))
+
+
+def submap_edges(state: MapState, noise: ViewNoise) -> list[Edge]:
+    """Return, for each frame seen again, the relative pose of its own submap and the one that saw it again."""
+    edges = []
+    for seen in state.sightings:
+        source = state.frames[seen.frame].submap
+        # Both views err: as much as two in the target's units.
+        covariance = 2.0 * _view_covariance(seen, state.map_from_submap[seen.submap].scale, noise)
+        edges.append(Edge(source, seen.submap, seen.frame_from_submap, covariance))
+    return edges
+
+
+def _view_covariance(seen: Sighting, scale: float, noise: ViewNoise) -> Float:
+    """Covariance (7, 7) of [rotation, translation, log scale], right perturbation in the submap's frame.
+
+    The camera turns about its own centre c: a point p moves by w x (p - c) + u + lambda (p - c).
+    """
+    centre = seen.submap_from_cam.translation
+    to_origin = np.eye(7)
+    to_origin[3:6, :3] = skew(centre)
+    to_origin[3:6, 6] = -centre
+    sigma = np.array([noise.rotation_rad] * 3 + [noise.position / scale] * 3 + [noise.log_scale])
+    return np.asarray((to_origin * sigma**2) @ to_origin.T)
 
 
 def consistent_priors(priors: Sequence[PosePrior], edges: Sequence[Edge]) -> list[PosePrior]:
@@ -102,16 +192,6 @@ def consistent_priors(priors: Sequence[PosePrior], edges: Sequence[Edge]) -> lis
     usual = {submap: sorted(values)[(len(values) - 1) // 2] for submap, values in misfits.items() if values}
     limit = OUTLYING_PRIOR * max(float(np.median(list(usual.values()))) if usual else 0.0, MEDIAN_MISFIT)
     return [prior for prior in priors if usual.get(prior.submap, 0.0) <= limit]
-
-
-def honest_edges(nodes: Mapping[int, Sim3], edges: Sequence[Edge]) -> list[Edge]:
-    """Return the edges with covariances that are as large, in the median, as the misfits at the given poses."""
-    if not edges:
-        return []
-    steps = [tangent(e.source_from_target.inverse() @ (nodes[e.source].inverse() @ nodes[e.target])) for e in edges]
-    misfit = [float(step @ np.linalg.solve(floored(e.covariance), step)) for step, e in zip(steps, edges, strict=True)]
-    factor = max(1.0, float(np.median(misfit)) / MEDIAN_MISFIT)
-    return [replace(edge, covariance=factor * edge.covariance) for edge in edges]
 
 
 def tangent(transform: Sim3) -> Float:

@@ -15,11 +15,11 @@ from ..options import RegistrationOptions
 from ..records import (
     Alignment,
     Correspondences,
-    Edge,
     FrameEdge,
     LocalModel,
     LocalView,
     Rejection,
+    Sighting,
     Subset,
 )
 from ..registration.align import align
@@ -50,7 +50,7 @@ class Registration:
     """A validated local model: where it goes, and which of its new images may come along."""
 
     alignment: Alignment
-    edges: tuple[Edge, ...]
+    sightings: tuple[Sighting, ...]
     residuals: tuple[PoseResidual, ...]
     accepted: tuple[int, ...]
     refused: tuple[Rejection, ...]
@@ -118,7 +118,7 @@ def register(
         return Rejection(subset.new, first.stage, first.reason, first.numbers)
     return Registration(
         alignment=alignment,
-        edges=_submap_edges(only(pairs, kept), state, alignment.residual),
+        sightings=_sightings(model, pairs, kept, state),
         residuals=verdict.residuals,
         accepted=tuple(accepted),
         refused=tuple(refused),
@@ -162,22 +162,17 @@ def _sample(view: LocalView, min_confidence: float, seed: int, count: int = 200)
     return np.asarray(points[np.random.default_rng(seed).permutation(len(points))[:count]], float)
 
 
-def _submap_edges(pairs: Correspondences, state: MapState, residual: float) -> tuple[Edge, ...]:
-    """One Sim(3) edge to each submap that predicted some of the references; the target is the next submap.
-
-    A single reference fits itself however wrong it is: what all references together miss is its error too.
-    """
-    target = state.next_submap()
-    owner = np.array([state.frames[int(i)].submap for i in pairs.reference], int)
-    edges = []
-    for source in np.unique(owner):
-        members = tuple(int(i) for i in np.unique(pairs.reference[owner == source]))
-        found = align(only(pairs, members), least_residual=residual)
-        if isinstance(found, Rejection):
-            continue
-        source_from_map = state.map_from_submap[int(source)].inverse()
-        edges.append(Edge(int(source), target, source_from_map @ found.map_from_local, found.covariance))
-    return tuple(edges)
+def _sightings(
+    model: LocalModel, pairs: Correspondences, kept: tuple[int, ...], state: MapState
+) -> tuple[Sighting, ...]:
+    """Return how the next submap sees each kept reference, by the Sim(3) of that one alone."""
+    sightings = []
+    for index in kept:
+        found = align(only(pairs, (index,)))
+        if not isinstance(found, Rejection):
+            frame_from_submap = state.submap_pose_of(index).inverse() @ found.map_from_local
+            sightings.append(Sighting(index, state.next_submap(), frame_from_submap, model.views[index].local_from_cam))
+    return tuple(sightings)
 
 
 def frame_edges(

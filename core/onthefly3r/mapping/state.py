@@ -1,4 +1,4 @@
-"""The map M_k: accepted frames, the submaps that predicted them, and the edges between those (Eq. 3, Eq. 14)."""
+"""The map M_k: accepted frames, the submaps that predicted them, and where those saw others again (Eq. 3, Eq. 14)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from itertools import islice
 from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.transforms import Rigid3, Sim3
-from ..records import CompactReference, Edge, Frame, FrameEdge, NewFrame, Observations, Submap
+from ..records import CompactReference, Frame, FrameEdge, NewFrame, Observations, Sighting, Submap
 from .journal import camera_from_json, rigid3_from_json, rigid3_to_json, sim3_from_json, sim3_to_json, submap_from_json
 from .store import Store
 
@@ -25,12 +25,12 @@ class MapState:
         self._store = store
         self.frames: dict[int, Frame] = {}
         self.map_from_submap: dict[int, Sim3] = {}
-        self.edges: list[Edge] = []
+        self.sightings: list[Sighting] = []
         self.frame_edges: list[FrameEdge] = []
         self.calibrations: dict[str, Camera] = {}
         self.spacing = float("nan")  # l_scene, map units
         self._moved: dict[int, Rigid3] = {}
-        self._refined: dict[int, Sim3] = {}
+        self._settled: dict[int, Sim3] = {}
 
     @classmethod
     def load(cls, store: Store) -> MapState:
@@ -42,10 +42,11 @@ class MapState:
                     state._take(submap_from_json(value))
                 elif kind == "spacing":
                     state.spacing = float(value)
-                elif kind == "submap_poses":
-                    state.map_from_submap.update({int(k): sim3_from_json(v) for k, v in value.items()})
+                elif kind == "settled":
+                    state.map_from_submap.update({int(k): sim3_from_json(v) for k, v in value["submaps"].items()})
+                    state._settled.update({int(k): sim3_from_json(v) for k, v in value["frames"].items()})
                 elif kind == "refined":
-                    state._refined.update({int(k): sim3_from_json(v) for k, v in value["frames"].items()})
+                    state._settled.update({int(k): sim3_from_json(v) for k, v in value["frames"].items()})
                     state.calibrations.update({k: camera_from_json(v) for k, v in value["calibrations"].items()})
                 elif kind == "frame_poses":
                     state._moved.update({int(k): rigid3_from_json(v) for k, v in value.items()})
@@ -72,8 +73,8 @@ class MapState:
         return self._store.reference(index)
 
     def submap_pose_of(self, index: int) -> Sim3:
-        """Return map_from_submap of the submap that predicted a frame, as refined for this frame if it was."""
-        return self._refined.get(index) or self.map_from_submap[self.frames[index].submap]
+        """Return map_from_submap of the submap that predicted a frame, as settled for this frame if it was."""
+        return self._settled.get(index) or self.map_from_submap[self.frames[index].submap]
 
     def commit(self, submap: Submap, frames: Sequence[NewFrame], observations: Observations | None = None) -> None:
         """Add one validated batch (Eq. 14); it is on disk before it counts."""
@@ -88,19 +89,24 @@ class MapState:
     def _take(self, submap: Submap) -> None:
         self.map_from_submap[submap.number] = submap.map_from_submap
         self.frames.update({frame.index: frame for frame in submap.frames})
-        self.edges.extend(submap.edges)
+        self.sightings.extend(submap.sightings)
         self.frame_edges.extend(submap.frame_edges)
         for key, camera in submap.calibrations.items():
             self.calibrations.setdefault(key, camera)
 
-    def move_submaps(self, map_from_submap: Mapping[int, Sim3]) -> None:
-        """Take over optimised submap poses; cameras, references and cloud follow."""
+    def move_submaps(self, map_from_submap: Mapping[int, Sim3], of_frames: Mapping[int, Sim3]) -> None:
+        """Take over optimised submap poses; cameras, references and cloud follow.
+
+        Frames in `of_frames` go where that says instead, each with its references and its part of the cloud.
+        """
         self.map_from_submap.update(map_from_submap)
-        self._store.note("submap_poses", {str(k): sim3_to_json(v) for k, v in map_from_submap.items()})
+        self._settled.update(of_frames)
+        submaps, frames = ({str(k): sim3_to_json(v) for k, v in m.items()} for m in (map_from_submap, of_frames))
+        self._store.note("settled", {"submaps": submaps, "frames": frames})
 
     def move_refined(self, map_from_submap: Mapping[int, Sim3], calibrations: Mapping[str, Camera]) -> None:
         """Take over refined frames, each with its references and its part of the cloud, and intrinsics."""
-        self._refined.update(map_from_submap)
+        self._settled.update(map_from_submap)
         self.calibrations.update(calibrations)
         frames = {str(k): sim3_to_json(v) for k, v in map_from_submap.items()}
         self._store.note("refined", {"frames": frames, "calibrations": {k: asdict(c) for k, c in calibrations.items()}})

@@ -19,12 +19,11 @@ INLIER = 3.0  # in robust standard deviations
 INDEPENDENT_POINTS_PER_REFERENCE = 3
 
 
-def align(pairs: Correspondences, images: tuple[int, ...] = (), least_residual: float = 0.0) -> Alignment | Rejection:
+def align(pairs: Correspondences, images: tuple[int, ...] = ()) -> Alignment | Rejection:
     """Return map_from_local minimising Eq. 11, closed form first, then iteratively reweighted with Huber.
 
     The kernel's width follows the residuals (median absolute deviation), so it needs no unit. `images` are named
-    in the `Rejection` that answers too few or degenerate correspondences. `least_residual` (map units) is what the
-    covariance takes the residuals for when they are smaller: few references fit well by accident.
+    in the `Rejection` that answers too few or degenerate correspondences.
     """
     if len(pairs.weight) < MIN_POINTS:
         return Rejection(images, "alignment", "too few corresponding points", {"points": float(len(pairs.weight))})
@@ -48,9 +47,7 @@ def align(pairs: Correspondences, images: tuple[int, ...] = (), least_residual: 
     references = tuple(int(i) for i in np.unique(pairs.reference))
     return Alignment(
         map_from_local=map_from_local,
-        covariance=_covariance(
-            pairs.local[inlier], max(spread, least_residual) / map_from_local.scale, len(references)
-        ),
+        covariance=_covariance(pairs.local[inlier], spread / map_from_local.scale, len(references)),
         inlier_ratio=float(inlier.mean()),
         residual=spread,
         n_points=len(distance),
