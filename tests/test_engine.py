@@ -32,7 +32,7 @@ def test_a_journal_gives_the_map_of_a_whole_run_again(tmp_path: Path) -> None:
     state, again = outcome.engine.state, MapState.load(Store(tmp_path))
     assert list(again.frames) == list(state.frames) and again.spacing == state.spacing
     assert again.calibrations == state.calibrations and len(again.calibrations) == 1
-    assert len(again.edges) == len(state.edges) and again.next_submap() == state.next_submap()
+    assert len(again.sightings) == len(state.sightings) and again.next_submap() == state.next_submap()
     for index in state.frames:
         np.testing.assert_allclose(again.map_from_cam(index).matrix(), state.map_from_cam(index).matrix(), atol=1e-14)
         np.testing.assert_array_equal(again.reference(index).points, state.reference(index).points)

@@ -27,7 +27,7 @@ from onthefly3r.mapping.journal import (
 )
 from onthefly3r.mapping.state import MapState
 from onthefly3r.mapping.store import Store
-from onthefly3r.records import Attitude, Edge, FrameEdge, GpsFix, NewFrame, Shot, Submap, WorkingImage
+from onthefly3r.records import Attitude, FrameEdge, GpsFix, NewFrame, Shot, Sighting, Submap, WorkingImage
 from synthetic_models import true_references, true_view
 
 LENS = Camera(4000, 3000, 2801.5, 2799.25, 2010.0, 1490.0, (-0.08, 0.02, 4e-4, -3e-4))
@@ -52,14 +52,13 @@ def image(index: int) -> WorkingImage:
     return WorkingImage(shot(), rgb, true_view(index).grid_from_photo)
 
 
-def batch(number: int, indices: list[int], edges: tuple[Edge, ...] = ()) -> tuple[Submap, list[NewFrame]]:
+def batch(number: int, indices: list[int], sightings: tuple[Sighting, ...] = ()) -> tuple[Submap, list[NewFrame]]:
     frames = [new_frame(i, number, true_view(i), image(i), 0.5, 300) for i in indices]
-    return Submap(number, pose(number), tuple(new.frame for new in frames), edges), frames
+    return Submap(number, pose(number), tuple(new.frame for new in frames), sightings), frames
 
 
-def edge(source: int, target: int) -> Edge:
-    root = np.random.default_rng(source).normal(size=(7, 7))
-    return Edge(source, target, pose(10 * source + target), root @ root.T)
+def sighting(frame: int, submap: int) -> Sighting:
+    return Sighting(frame, submap, pose(10 * frame + submap), rigid(20 * frame + submap))
 
 
 def filled(work: Path) -> MapState:
@@ -67,10 +66,10 @@ def filled(work: Path) -> MapState:
     state.set_spacing(0.0123)
     submap, frames = batch(0, [4, 2, 9])
     state.commit(replace(submap, calibrations={"maker model": LENS}), frames)
-    submap, frames = batch(1, [7, 1], (edge(0, 1),))
+    submap, frames = batch(1, [7, 1], (sighting(4, 1),))
     seen = FrameEdge(4, 7, rigid(3), 0.01, 0.2, "ref")
     state.commit(replace(submap, frame_edges=(seen,), calibrations={"maker model": replace(LENS, fx=1.0)}), frames)
-    state.move_submaps({1: pose(77)})
+    state.move_submaps({1: pose(77)}, {2: pose(78)})
     return state
 
 
@@ -89,10 +88,14 @@ def assert_same(one: MapState, other: MapState) -> None:
         np.testing.assert_array_equal(one.map_from_cam(index).matrix(), other.map_from_cam(index).matrix())
         for name in ("pixels", "points", "confidence"):
             np.testing.assert_array_equal(getattr(one.reference(index), name), getattr(other.reference(index), name))
-    for first, second in zip(one.edges, other.edges, strict=True):
-        assert (first.source, first.target) == (second.source, second.target)
-        np.testing.assert_array_equal(first.covariance, second.covariance)
-        np.testing.assert_array_equal(first.source_from_target.matrix(), second.source_from_target.matrix())
+    for first, second in zip(one.sightings, other.sightings, strict=True):
+        assert_same_sighting(first, second)
+
+
+def assert_same_sighting(one: Sighting, other: Sighting) -> None:
+    assert (one.frame, one.submap) == (other.frame, other.submap)
+    np.testing.assert_array_equal(one.frame_from_submap.matrix(), other.frame_from_submap.matrix())
+    np.testing.assert_array_equal(one.submap_from_cam.matrix(), other.submap_from_cam.matrix())
 
 
 def test_a_journal_gives_the_same_map_again(tmp_path: Path) -> None:
@@ -108,10 +111,19 @@ def test_a_journal_gives_the_same_map_again(tmp_path: Path) -> None:
 def test_cameras_references_and_cloud_move_with_their_submap(tmp_path: Path) -> None:
     state = filled(tmp_path)
     before, unmoved = state.map_from_cam(7), state.map_from_cam(4)
-    state.move_submaps({1: pose(5) @ pose(77)})
+    state.move_submaps({1: pose(5) @ pose(77)}, {})
     np.testing.assert_allclose(state.map_from_cam(7).matrix(), pose(5).apply_to_pose(before).matrix(), atol=1e-12)
     assert state.submap_pose_of(7) is state.map_from_submap[1]
     np.testing.assert_array_equal(state.map_from_cam(4).matrix(), unmoved.matrix())
+
+
+def test_a_settled_frame_leaves_its_submap_with_its_points(tmp_path: Path) -> None:
+    state = filled(tmp_path)
+    for map_ in (state, MapState.load(Store(tmp_path))):
+        np.testing.assert_array_equal(map_.submap_pose_of(2).matrix(), pose(78).matrix())
+        settled = pose(78).apply_to_pose(map_.frames[2].submap_from_cam)
+        np.testing.assert_array_equal(map_.map_from_cam(2).matrix(), settled.matrix())
+        assert map_.submap_pose_of(4) is map_.map_from_submap[0]
 
 
 def test_the_papers_graph_moves_cameras_only(tmp_path: Path) -> None:
@@ -178,8 +190,9 @@ def test_a_torn_last_line_never_counted(tmp_path: Path, kept: int) -> None:
         ("[1, 2]", "line 2: damaged"),
         ('{"a": 1, "b": 2}', "line 2: damaged"),
         ('{"submap": {"frames": []}}', "'submap' is damaged"),
-        ('{"submap_poses": {"0": {"scale": "much"}}}', "'submap_poses' is damaged"),
-        ('{"submap_poses": [1]}', "'submap_poses' is damaged"),
+        ('{"settled": {"submaps": {"0": {"scale": "much"}}, "frames": {}}}', "'settled' is damaged"),
+        ('{"settled": {"submaps": {}, "frames": [1]}}', "'settled' is damaged"),
+        ('{"settled": [1]}', "'settled' is damaged"),
         ('{"spacing": null}', "'spacing' is damaged"),
     ],
 )
@@ -207,11 +220,11 @@ def test_transforms_survive_json_to_the_last_digit() -> None:
 
 
 def test_a_submap_survives_json() -> None:
-    submap = replace(batch(3, [4, 5], (edge(0, 3),))[0], calibrations={"k": LENS})
+    submap = replace(batch(3, [4, 5], (sighting(4, 3),))[0], calibrations={"k": LENS})
     again = submap_from_json(through_text(submap_to_json(submap)))
     assert again.calibrations == {"k": LENS} and again.number == 3
     assert [f.index for f in again.frames] == [4, 5]
-    np.testing.assert_array_equal(again.edges[0].covariance, submap.edges[0].covariance)
+    assert_same_sighting(again.sightings[0], submap.sightings[0])
 
 
 @pytest.mark.parametrize("complete", [True, False])

@@ -12,7 +12,7 @@ import numpy as np
 
 from onthefly3r.geometry.arrays import Float
 from onthefly3r.geometry.transforms import Rigid3, Sim3
-from onthefly3r.mapping.posegraph import default_solver, has_loops
+from onthefly3r.mapping.posegraph import default_solver
 from onthefly3r.records import Correspondences, Edge, LocalModel, LocalView, Rejection
 from onthefly3r.registration.align import align
 
@@ -61,7 +61,8 @@ def settle(pieces: Sequence[Piece], edges: Sequence[Edge], root: int) -> dict[in
     """
     poses = _along(_spanning_tree([piece.number for piece in pieces], edges), root)
     inside = [edge for edge in edges if edge.source in poses]
-    return default_solver().solve_sim3(poses, inside, (), fixed=root) if has_loops(len(poses), inside) else poses
+    has_loops = len(inside) > len(poses) - 1  # more edges than a tree: only then is there anything to balance
+    return default_solver().solve_sim3(poses, inside, (), fixed=root) if has_loops else poses
 
 
 def _spanning_tree(numbers: Sequence[int], edges: Sequence[Edge]) -> dict[int, list[tuple[int, Sim3]]]:

@@ -39,9 +39,11 @@ from .stopwatch import Stopwatch
 READ_AT_ONCE = 8  # photographs per thread between two steps of progress
 SEED_ATTEMPTS = 5
 MIN_SEED_SHARE = 0.5
-# Drift is removed whenever the map has grown by so many submaps, or by this share: the work stays linear.
+# Drift is removed when it shows, or when the map has grown by this share, but not before it has so many new submaps:
+# where little is new, chance moves a map as much as what is learnt, and may move it away from the truth.
 SETTLE_EVERY = 20
-SETTLE_GROWTH = 0.1
+SETTLE_GROWTH = 1.0
+DRIFT_SHOWS = 2.2  # times the usual residual: references that far apart were placed along different ways
 
 
 class Engine:
@@ -75,6 +77,8 @@ class Engine:
         self.state = MapState(self.store)
         self.backbone_calls = 0
         self.batch_sizes: list[int] = []
+        self._residuals: list[float] = []  # of all alignments, map units
+        self._drift_shows = False
         self.pruned_references = 0
         self.refinement: Mapping[str, float] = {}
         self.warnings: list[str] = []
@@ -274,11 +278,12 @@ class Engine:
             extra = frame_edges(model, outcome, retrieved, self.state)
         submap = Submap(number, outcome.alignment.map_from_local, (), outcome.sightings, extra)
         self.batch_sizes.append(len(outcome.accepted))
+        self._residuals.append(outcome.alignment.residual)
+        self._drift_shows |= outcome.alignment.residual > DRIFT_SHOWS * float(np.median(self._residuals))
         self._commit(model, submap, outcome.accepted)
         for refused in outcome.refused:
             self._set_aside_images(refused)
-        grown = number + 1 - self._settled_submaps
-        if grown >= max(SETTLE_EVERY, SETTLE_GROWTH * number) and self.options.pose_graph.pose_graph != "se3":
+        if self._has_drift() and self.options.pose_graph.pose_graph != "se3":
             self._settle()
 
     def _next_subset(self) -> Subset:
@@ -387,8 +392,15 @@ class Engine:
 
     # ------------------------------------------------------------------ drift
 
+    def _has_drift(self) -> bool:
+        """Return whether there is more to gain from a pass of the pose graph than chance can spoil."""
+        submaps = len(self.state.map_from_submap)
+        grown = submaps - self._settled_submaps
+        return grown >= SETTLE_EVERY and (self._drift_shows or grown >= SETTLE_GROWTH * self._settled_submaps)
+
     def _settle(self) -> None:
         """Tie the map to the positions as it is now, and remove its drift."""
+        self._drift_shows = False
         graph = self.options.pose_graph
         with self.stopwatch.stage("pose graph"):
             self._settled_submaps = len(self.state.map_from_submap)

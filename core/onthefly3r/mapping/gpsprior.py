@@ -31,6 +31,9 @@ PRIOR_STEPS = 8
 SETTLED = 1e-6
 MAX_STEP = 0.2  # rad, or of the logarithm of scale, at a time: positions of one place tell nothing of either
 MIN_EIGENVALUE = 1e-4  # of the largest: directions of a submap that its positions do not determine
+# Of the extent of a submap's cameras, or rad: what positions know worse than that the map knows better. The roll of a
+# strip follows from how far the cameras are off its line, which is little more than noise.
+MAX_SIGMA = 0.05
 VOTE_SIGMAS = 5.0
 VOTE_SHARE = 0.2  # of the distance to the references, by which the map may be warped or turned here
 
@@ -168,7 +171,7 @@ def _prior(submap: int, pose: Sim3, points: Float, targets: Float, root: Float) 
         information = np.einsum("n,nki,nkj->ij", weight, jacobian, jacobian)
         gradient = np.einsum("n,nki,nk->i", weight, jacobian, residual)
         values, vectors = np.linalg.eigh(information)
-        known = values > MIN_EIGENVALUE * values[-1]
+        known = values > max(MIN_EIGENVALUE * values[-1], MAX_SIGMA**-2)
         values, vectors = values[known], vectors[:, known]
         step = vectors @ ((vectors.T @ gradient) / values)
         step = step * min(1.0, MAX_STEP / max(float(np.abs(step[[0, 1, 2, 6]]).max()), 1e-12))

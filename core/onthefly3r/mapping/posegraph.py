@@ -24,7 +24,7 @@ from .state import MapState
 HUBER = 1.345  # whitened units
 MAX_ITERATIONS = 30
 MEDIAN_MISFIT = 6.35  # of a chi-squared variable of seven degrees of freedom
-OUTLYING_PRIOR = 50.0  # times the usual squared misfit
+OUTLYING_PRIOR = 10.0  # times the usual squared misfit
 ROUNDS = 2  # of solving the graph with the noise that the misfits show
 FRAMES = 2**32  # nodes of frames are numbered from here, those of submaps from 0
 # Median of the mean square of three standard normal variables, and of the square of one.
@@ -210,8 +210,3 @@ def optimise_frames(state: MapState, solver: PoseGraphSolver) -> None:
     nodes = {index: state.map_from_cam(index) for index in state.frames}
     if state.frame_edges:
         state.move_frames(solver.solve_se3(nodes, state.frame_edges, fixed=next(iter(state.frames))))
-
-
-def has_loops(n_nodes: int, edges: Sequence[Edge]) -> bool:
-    """Return whether a connected graph has more edges than a tree: only then is there anything to balance."""
-    return len(edges) > n_nodes - 1
