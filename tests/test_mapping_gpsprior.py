@@ -114,6 +114,20 @@ def test_a_straight_map_is_left_alone(tmp_path: Path) -> None:
         assert rotation_angle_deg(off.rotation) < 0.05 and abs(np.log(off.scale)) < 1e-3
 
 
+def test_positions_do_not_tell_the_roll_of_a_strip(tmp_path: Path) -> None:
+    """Five cameras all but on a line, whose local model is less accurate than their positions."""
+    enu = places()
+    state = map_of(tmp_path, enu + np.random.default_rng(2).normal(0.0, 0.15, enu.shape))
+    shots = shots_at(enu, RTK_M)
+    turns = []
+    for prior in pose_priors(state, tie_of(state, shots), shots):
+        off = state.map_from_submap[prior.submap].inverse() @ prior.map_from_submap
+        turns.append(rotation_angle_deg(off.rotation))
+        values = np.linalg.eigvalsh(prior.information)
+        assert values[0] < 1e-9 * values[-1]  # one direction is open
+    assert max(turns) < 2.0
+
+
 def test_a_wrong_position_within_a_submap_counts_little(tmp_path: Path) -> None:
     enu = places()
     wrong = enu.copy()

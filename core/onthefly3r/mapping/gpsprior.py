@@ -94,7 +94,7 @@ def pose_priors(state: MapState, tie: GpsTie, shots: Mapping[int, Shot]) -> list
         points = np.array([state.frames[i].submap_from_cam.translation for i in images])
         root = np.sqrt(weight)[:, :, None] * rotation  # whitens map residuals, (n, 3, 3)
         priors.append(_prior(submap, state.map_from_submap[submap], points, map_positions[rows], root))
-    return priors
+    return [prior for prior in priors if prior is not None]
 
 
 def gps_disagreement(
@@ -149,16 +149,17 @@ def _rows(positions: Positions, rows: Int) -> Positions:
     )
 
 
-def _prior(submap: int, pose: Sim3, points: Float, targets: Float, root: Float) -> PosePrior:
-    """Return pose and information (7, 7) of the submap that its cameras' positions suggest, by Gauss-Newton.
+def _prior(submap: int, pose: Sim3, points: Float, targets: Float, root: Float) -> PosePrior | None:
+    """Return pose and information (7, 7) of a submap as its cameras' positions suggest, None where they say nothing.
 
     A right perturbation [w, u, lambda] of the pose moves a point p by s R (w x p + u + lambda p). It is estimated
-    about the middle of the points and in units of their extent, where what they determine stands apart from what
-    they leave open; that stays as it is, and carries no weight.
+    about the middle of the points and in units of their extent (of what positions tell from each other, where that is
+    more), where what they determine stands apart from what they leave open; that stays as it is, and carries no weight.
     """
     middle = points.mean(axis=0)
     centred = points - middle
-    extent = max(float(np.sqrt((centred**2).sum(axis=1).mean())), 1e-9)
+    sigma = 1.0 / (pose.scale * float(np.linalg.norm(root, ord=2, axis=(1, 2)).max()))
+    extent = max(float(np.sqrt((centred**2).sum(axis=1).mean())), 2.0 * sigma / MAX_SIGMA)
     # u' = (u + w x middle + lambda middle) / extent
     from_origin = np.eye(7)
     from_origin[3:6] = np.column_stack([-skew(middle), np.eye(3), middle]) / extent
@@ -172,6 +173,8 @@ def _prior(submap: int, pose: Sim3, points: Float, targets: Float, root: Float) 
         gradient = np.einsum("n,nki,nk->i", weight, jacobian, residual)
         values, vectors = np.linalg.eigh(information)
         known = values > max(MIN_EIGENVALUE * values[-1], MAX_SIGMA**-2)
+        if not known.any():  # far off, alone
+            return None
         values, vectors = values[known], vectors[:, known]
         step = vectors @ ((vectors.T @ gradient) / values)
         step = step * min(1.0, MAX_STEP / max(float(np.abs(step[[0, 1, 2, 6]]).max()), 1e-12))
