@@ -6,7 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from qgis.core import QgsProcessingAlgorithm, QgsProcessingException, QgsProcessingFeedback
+from qgis.core import (
+    QgsProcessingAlgorithm,
+    QgsProcessingContext,
+    QgsProcessingException,
+    QgsProcessingFeedback,
+)
 from qgis.PyQt.QtCore import QCoreApplication
 from qgis.PyQt.QtGui import QIcon
 
@@ -22,13 +27,13 @@ Stages = Mapping[str, tuple[int, int]]
 
 # Where each stage of a run begins and ends on the bar, in per cent; measured on surveys of 20 to 170 photographs.
 RUN_STAGES: Stages = {
-    "reading photographs": (0, 25),
-    "starting the map": (25, 30),
-    "reconstructing": (30, 83),
-    "refining the cameras": (83, 85),
-    "georeferencing": (85, 86),
-    "collecting points": (86, 92),
-    "fusing the cloud": (92, 99),
+    "reading photographs": (0, 20),
+    "starting the map": (20, 27),
+    "reconstructing": (27, 77),
+    "refining the cameras": (77, 84),
+    "georeferencing": (84, 85),
+    "collecting points": (85, 90),
+    "fusing the cloud": (90, 99),
 }
 EXPORT_STAGES: Stages = {"collecting points": (0, 50), "fusing the cloud": (50, 99)}
 
@@ -122,6 +127,17 @@ class CoreAlgorithm(QgsProcessingAlgorithm):
         if self.needs_environment and not settings.interpreter():
             return False, tr(NO_INTERPRETER)
         return True, ""
+
+    def check(self, parameters: dict[str, Any], context: QgsProcessingContext) -> None:
+        """Raise `QgsProcessingException` with what is wrong about the parameters; called before anything starts."""
+
+    def checkParameterValues(self, parameters: dict[str, Any], context: QgsProcessingContext) -> tuple[bool, str]:
+        """Return whether the parameters will do, and what is wrong with them."""
+        try:
+            self.check(parameters, context)
+        except QgsProcessingException as error:
+            return False, str(error)
+        return super().checkParameterValues(parameters, context)
 
     def run_core(self, job: Job, feedback: QgsProcessingFeedback) -> dict[str, Any]:
         """Run a job and return the data of its result; raises `QgsProcessingException` with the remedy."""

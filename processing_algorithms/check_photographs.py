@@ -14,7 +14,6 @@ from qgis.core import (
     QgsPointXY,
     QgsProcessing,
     QgsProcessingContext,
-    QgsProcessingException,
     QgsProcessingFeedback,
     QgsProcessingOutputNumber,
     QgsProcessingOutputString,
@@ -101,14 +100,10 @@ class CheckPhotographs(CoreAlgorithm):
             self.addOutput(QgsProcessingOutputNumber(name, tr(title)))
         self.addOutput(QgsProcessingOutputString("WARNINGS", tr("What to know about the whole flight")))
 
-    def checkParameterValues(self, parameters: dict[str, Any], context: QgsProcessingContext) -> tuple[bool, str]:
+    def check(self, parameters: dict[str, Any], context: QgsProcessingContext) -> None:
         """Tell wrong folders before anything starts."""
-        try:
-            require_folder(self.parameterAsString(parameters, PHOTOS, context), tr("Folder of photographs"))
-            options_from(self, parameters, context)
-        except QgsProcessingException as error:
-            return False, str(error)
-        return super().checkParameterValues(parameters, context)
+        require_folder(self.parameterAsString(parameters, PHOTOS, context), tr("Folder of photographs"))
+        options_from(self, parameters, context)
 
     def processAlgorithm(
         self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback

@@ -44,13 +44,9 @@ class EarlierRunAlgorithm(CoreAlgorithm):
             )
         return run
 
-    def checkParameterValues(self, parameters: dict[str, Any], context: QgsProcessingContext) -> tuple[bool, str]:
+    def check(self, parameters: dict[str, Any], context: QgsProcessingContext) -> None:
         """Tell wrong folders before anything starts."""
-        try:
-            self.run_folder(parameters, context)
-        except QgsProcessingException as error:
-            return False, str(error)
-        return super().checkParameterValues(parameters, context)
+        self.run_folder(parameters, context)
 
     def export(self, run: Path, out: Path, options: dict[str, Any], feedback: QgsProcessingFeedback) -> dict[str, Any]:
         """Write the files of the run again into `out`, with options that replace those of the run."""

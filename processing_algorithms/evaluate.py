@@ -117,13 +117,10 @@ class Evaluate(EarlierRunAlgorithm):
         for name, (_, _, metric, unit, meaning) in METRICS.items():
             self.addOutput(QgsProcessingOutputNumber(name, f"{metric} [{unit or 1}]: {tr(meaning)}"))
 
-    def checkParameterValues(self, parameters: dict[str, Any], context: QgsProcessingContext) -> tuple[bool, str]:
+    def check(self, parameters: dict[str, Any], context: QgsProcessingContext) -> None:
         """Tell what is missing before anything starts."""
-        try:
-            self._references(parameters, context)
-        except QgsProcessingException as error:
-            return False, str(error)
-        return super().checkParameterValues(parameters, context)
+        super().check(parameters, context)
+        self._references(parameters, context)
 
     def processAlgorithm(
         self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback

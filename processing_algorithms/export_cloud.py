@@ -61,14 +61,16 @@ class ExportCloud(EarlierRunAlgorithm):
         self.addOutput(QgsProcessingOutputNumber("SPACING", tr("Mean distance of points [m]")))
         self.addOutput(QgsProcessingOutputString("CRS_OUT", tr("Coordinate reference system of the cloud")))
 
-    def checkParameterValues(self, parameters: dict[str, Any], context: QgsProcessingContext) -> tuple[bool, str]:
+    def check(self, parameters: dict[str, Any], context: QgsProcessingContext) -> None:
         """Tell wrong endings before anything starts."""
+        super().check(parameters, context)
         path = self.parameterAsFileOutput(parameters, OUTPUT, context)
         if _format(path) not in FORMATS:
-            return False, tr("{} ends neither in .laz nor in .las.").format(path)
+            raise QgsProcessingException(tr("{} ends neither in .laz nor in .las.").format(path))
         if path.lower().endswith(".copc.laz"):
-            return False, tr("{}: clouds are written as plain LAZ, not as COPC: leave out .copc.").format(path)
-        return super().checkParameterValues(parameters, context)
+            raise QgsProcessingException(
+                tr("{}: clouds are written as plain LAZ, not as COPC: leave out .copc.").format(path)
+            )
 
     def processAlgorithm(
         self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback

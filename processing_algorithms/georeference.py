@@ -45,16 +45,12 @@ class Georeference(EarlierRunAlgorithm):
         )
         add_run_outputs(self)
 
-    def checkParameterValues(self, parameters: dict[str, Any], context: QgsProcessingContext) -> tuple[bool, str]:
+    def check(self, parameters: dict[str, Any], context: QgsProcessingContext) -> None:
         """Tell what is wrong before anything starts."""
-        try:
-            options_from(self, parameters, context)
-            run = self.run_folder(parameters, context)
-        except QgsProcessingException as error:
-            return False, str(error)
+        options_from(self, parameters, context)
+        run = self.run_folder(parameters, context)
         if Path(self.parameterAsString(parameters, OUTPUT, context)).resolve() == run.resolve():
-            return False, tr("The output folder is that of the run: name another one.")
-        return super().checkParameterValues(parameters, context)
+            raise QgsProcessingException(tr("The output folder is that of the run: name another one."))
 
     def processAlgorithm(
         self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback

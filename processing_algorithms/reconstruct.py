@@ -7,7 +7,6 @@ from typing import Any
 
 from qgis.core import (
     QgsProcessingContext,
-    QgsProcessingException,
     QgsProcessingFeedback,
     QgsProcessingParameterFile,
     QgsProcessingParameterFolderDestination,
@@ -71,14 +70,10 @@ class ReconstructPhotographs(CoreAlgorithm):
         )
         add_run_outputs(self)
 
-    def checkParameterValues(self, parameters: dict[str, Any], context: QgsProcessingContext) -> tuple[bool, str]:
+    def check(self, parameters: dict[str, Any], context: QgsProcessingContext) -> None:
         """Tell wrong folders before anything starts."""
-        try:
-            require_folder(self.parameterAsString(parameters, PHOTOS, context), tr("Folder of photographs"))
-            options_from(self, parameters, context)
-        except QgsProcessingException as error:
-            return False, str(error)
-        return super().checkParameterValues(parameters, context)
+        require_folder(self.parameterAsString(parameters, PHOTOS, context), tr("Folder of photographs"))
+        options_from(self, parameters, context)
 
     def processAlgorithm(
         self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback

@@ -95,14 +95,10 @@ class ReconstructFlights(CoreAlgorithm):
         self.addOutput(QgsProcessingOutputNumber("DONE", tr("Flights that are done")))
         self.addOutput(QgsProcessingOutputNumber("FAILED", tr("Flights that failed")))
 
-    def checkParameterValues(self, parameters: dict[str, Any], context: QgsProcessingContext) -> tuple[bool, str]:
+    def check(self, parameters: dict[str, Any], context: QgsProcessingContext) -> None:
         """Tell what is wrong before anything starts."""
-        try:
-            self._flights(parameters, context)
-            options_from(self, parameters, context)
-        except QgsProcessingException as error:
-            return False, str(error)
-        return super().checkParameterValues(parameters, context)
+        self._flights(parameters, context)
+        options_from(self, parameters, context)
 
     def processAlgorithm(
         self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback

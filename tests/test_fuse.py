@@ -160,14 +160,25 @@ def test_result_does_not_depend_on_tiles_quarters_and_buffers(
     assert np.array_equal(whole.views[by_place[0]], cut.views[by_place[1]])
 
 
-def test_temporary_files_are_removed_also_when_cancelled(tmp_path: Path) -> None:
+@pytest.mark.parametrize("threads", [1, 3])
+def test_temporary_files_are_removed_also_when_cancelled(tmp_path: Path, threads: int) -> None:
     def stop(done: int, total: int) -> None:
         raise RuntimeError(f"{done} of {total}")
 
     points = ground(np.random.default_rng(0), 1_000, 50.0)
     with pytest.raises(RuntimeError, match="1 of 4"):
-        list(fuse([batch(points - ORIGIN - [25.0, 25.0, 0.0])], 0.1, 0.0, tmp_path, False, stop))
+        list(fuse([batch(points - ORIGIN - [25.0, 25.0, 0.0])], 0.1, 0.0, tmp_path, False, stop, threads))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_same_cloud_in_the_same_order_whatever_the_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spill, "BUFFER_POINTS", 3_000)  # several files
+    rng = np.random.default_rng(4)
+    batches = [batch(ground(rng, 2_000, 90.0), source, 0.7) for source in range(5)]
+    alone, together = (list(fuse(batches, 0.2, 0.0, tmp_path, True, threads=threads)) for threads in (1, 3))
+    assert len(alone) == len(together) > 3
+    for one, other in zip(alone, together, strict=True):
+        assert np.array_equal(one.points, other.points) and np.array_equal(one.confidence, other.confidence)
 
 
 def test_files_of_a_killed_run_are_cleared(tmp_path: Path) -> None:

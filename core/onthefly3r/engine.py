@@ -36,7 +36,8 @@ from .selection.seed import choose_seed
 from .selection.subset import build_subset, fixed_subset
 from .stopwatch import Stopwatch
 
-READ_AT_ONCE = 8  # photographs per thread between two steps of progress
+# Photographs between two steps of progress, per thread and at most: the image cache must hold them all.
+READ_AT_ONCE, MOST_READ_AT_ONCE = 8, 48
 SEED_ATTEMPTS = 5
 MIN_SEED_SHARE = 0.5
 # Drift is removed when it shows, or when the map has grown by this share, but not before it has so many new submaps:
@@ -138,7 +139,7 @@ class Engine:
         new = {len(self.shots) + i: shot for i, shot in enumerate(shots)}
         self.shots.update(new)
         threads = self.options.backbone.threads or os.cpu_count() or 1
-        at_once = READ_AT_ONCE * threads
+        at_once = min(READ_AT_ONCE * threads, MOST_READ_AT_ONCE)
         with ThreadPoolExecutor(threads) as pool:
             for start in range(0, len(new), at_once):
                 self._checkpoint("reading photographs", start, len(new))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -69,7 +69,8 @@ def fuse(
     if first is None:
         return
     reach = _stray_reach(first, spacing_m) if stray_filter else 0
-    with Spill(work, spacing_m, TILE_VOXELS, reach) as spill:
+    at_once = min(threads, MAX_TILES_AT_ONCE)
+    with Spill(work, spacing_m, TILE_VOXELS, reach) as spill, ThreadPoolExecutor(at_once) as pool:
         for batch in chain([first], batches):
             spill.add(batch)
         spill.flush()
@@ -81,23 +82,22 @@ def fuse(
             squares = _squares(spill, tile, corner, TILE_VOXELS, reach)
             return [_fuse_square(square, spacing_m, min_confidence, reach) for square in squares]
 
-        for done, parts in enumerate(_mapped(fused, tiles, min(threads, MAX_TILES_AT_ONCE)), start=1):
+        for done, parts in enumerate(_mapped(pool, fused, tiles, at_once), start=1):
             yield from (part for part in parts if len(part.points))
             if progress is not None:
                 progress(done, len(tiles))
 
 
 def _mapped(
-    function: Callable[[Tile], list[CloudTile]], tiles: Sequence[Tile], threads: int
+    pool: Executor, function: Callable[[Tile], list[CloudTile]], tiles: Sequence[Tile], at_once: int
 ) -> Iterator[list[CloudTile]]:
-    """Yield the results in order; only so many as there are threads are made ahead, for the sake of memory."""
-    with ThreadPoolExecutor(threads) as pool:
-        ahead = deque(pool.submit(function, tile) for tile in tiles[:threads])
-        for following in [*tiles[threads:], *[None] * len(ahead)]:
-            result = ahead.popleft().result()
-            if following is not None:
-                ahead.append(pool.submit(function, following))
-            yield result
+    """Yield the results in order; only so many are made ahead, for the sake of memory."""
+    ahead = deque(pool.submit(function, tile) for tile in tiles[:at_once])
+    for following in [*tiles[at_once:], *[None] * len(ahead)]:
+        result = ahead.popleft().result()
+        if following is not None:
+            ahead.append(pool.submit(function, following))
+        yield result
 
 
 @dataclass(frozen=True)
