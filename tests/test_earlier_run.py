@@ -12,29 +12,32 @@ from onthefly3r.options import Options
 from onthefly3r.run import earlier_options
 
 
-def write_report(folder: Path, options: Options) -> None:
-    report = {"software": {"options": options.to_flat()}}
-    (folder / "report.json").write_text(json.dumps(report), encoding="utf-8")
+def write(folder: Path, text: str) -> None:
+    (folder / "work").mkdir()
+    (folder / "work" / "run.json").write_text(text, encoding="utf-8")
+
+
+def write_record(folder: Path, options: Options) -> None:
+    write(folder, json.dumps({"options": options.to_flat()}))
 
 
 def test_georeferencing_and_export_stay_as_they_were_but_not_its_files(tmp_path: Path) -> None:
     named = {"crs": "EPSG:25833", "vertical": "egm96", "spacing_m": 0.3, "format": "las", "stray_filter": False}
     files = {"boundary": "gone.geojson", "positions": "geo.txt", "cloud": False, "seed_size": 12}
-    write_report(tmp_path, Options.from_flat({**named, **files}))
+    write_record(tmp_path, Options.from_flat({**named, **files}))
     kept = earlier_options(tmp_path)
     assert Options.from_flat(kept) == Options.from_flat(named)
     assert not set(files) & set(kept)
 
 
 def test_options_of_an_older_version_may_lack_some(tmp_path: Path) -> None:
-    text = json.dumps({"software": {"options": {"vertical": "egm96", "an_option_of_old": 3}}})
-    (tmp_path / "report.json").write_text(text, encoding="utf-8")
+    write(tmp_path, json.dumps({"options": {"vertical": "egm96", "an_option_of_old": 3}}))
     assert earlier_options(tmp_path) == {"vertical": "egm96"}
 
 
-@pytest.mark.parametrize("text", [None, "{", "[]", '{"software": {}}'])
+@pytest.mark.parametrize("text", [None, "{", "[]", '{"shots": {}}'])
 def test_folder_that_is_no_run(text: str | None, tmp_path: Path) -> None:
     if text is not None:
-        (tmp_path / "report.json").write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match="is no report of a run"):
+        write(tmp_path, text)
+    with pytest.raises(InputError, match="is no record of a run"):
         earlier_options(tmp_path)

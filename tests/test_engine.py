@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from onthefly3r.errors import Cancelled, PhotographError
 from onthefly3r.mapping.state import MapState
 from onthefly3r.mapping.store import Store
 from onthefly3r.options import Options
+from onthefly3r.records import LocalModel, Rejection, Subset
 from onthefly3r.simulate.oracle import Faults, OracleBackbone, OracleDescriber, oracle_shots
 from oracle_runs import GRID_PX, NO_GPS, camera_errors, run, survey_of
 
@@ -192,6 +194,37 @@ def test_cancelling_ends_the_run_and_keeps_what_was_placed(tmp_path: Path) -> No
         engine.add_all(oracle_shots(survey_of(60, 4)))
         engine.finish()
     assert len(MapState.load(Store(tmp_path / "second")).frames) >= 25
+
+
+class Vanishing:
+    """A backbone on a disk from which three photographs go after some calls."""
+
+    gone = (7, 31, 50)
+
+    def __init__(self, inner: OracleBackbone, calls: int) -> None:
+        self.spec = inner.spec
+        self._inner = inner
+        self._calls_left = calls
+
+    def reconstruct(self, subset: Subset, images: Any, calibrations: Any) -> LocalModel | Rejection:
+        self._calls_left -= 1
+        for index in set(subset.members) & set(self.gone) if self._calls_left < 0 else ():
+            raise PhotographError(images[index].shot.name, "cannot be read (gone)")
+        return self._inner.reconstruct(subset, images, calibrations)
+
+
+@pytest.mark.parametrize("calls", [0, 4])
+def test_photographs_that_go_meanwhile_are_left_out(tmp_path: Path, calls: int) -> None:
+    """Before the seed all three are lost; later those that are in the map stay, and no more is asked of them."""
+    engine = empty_engine(tmp_path)
+    engine._backbone = Vanishing(engine._backbone, calls)  # type: ignore[arg-type]
+    engine.add_all(oracle_shots(survey_of(60, 4)))
+    engine.finish()
+    lost = [i for i in Vanishing.gone if i not in engine.state.frames]
+    assert len(engine.state.frames) == 60 - len(lost)
+    assert sorted(engine.rejections) == lost
+    assert {(r.stage, r.reason) for r in engine.rejections.values()} <= {("intake", "cannot be read (gone)")}
+    assert len(lost) == 3 if calls == 0 else len(lost) < 3
 
 
 def test_progress_counts_images(tmp_path: Path) -> None:

@@ -26,14 +26,15 @@ def test_every_form_of_a_line(tmp_path: Path) -> None:
         "EPSG:4326",
         "a.jpg 15.5 48.2",
         "b.jpg\t15.5\t48.2\t310 # note",
-        "c.jpg 15.5 48.2 310 30 -90 0",
-        "d e.jpg\t15.5\t48.2\t310\t30\t-90\t0\t0.02\t0.04",
+        "c.jpg 15.5 48.2 310 30 0 0",
+        "d e.jpg\t15.5\t48.2\t310\t30\t60\t1\t0.02\t0.04",
     )
     text = "\n".join(lines)
     a, b, c, d = read_positions(file(tmp_path, text))
     assert a.gps == GpsFix(48.2, 15.5, None)
     assert b.gps.height_m == 310.0
     assert (c.attitude, c.gps.sigma_h_m) == (Attitude(30.0, -90.0, 0.0), None)
+    assert d.attitude == Attitude(30.0, -30.0, 1.0)  # of a gimbal: -90 looks down, 0 to the horizon
     assert (d.name, d.gps.sigma_h_m, d.gps.sigma_v_m) == ("d e.jpg", 0.02, 0.04)
 
 

@@ -192,7 +192,10 @@ def test_weights_are_what_the_network_runs_with(survey_folder: Path, weights: Pa
     from safetensors.torch import save_file
 
     save_file({"gain": torch.tensor([2.0 * GAIN])}, weights)
-    run(survey_folder, tmp_path / "out", "--weights", weights, "--local")
+    first = sorted((survey_folder / "photos").iterdir())[0].name
+    (tmp_path / "geo.txt").write_text(f"EPSG:4326\n{first} 15 48 300\n", encoding="utf-8")  # no scale from positions
+    positions = ("--local", "--positions", tmp_path / "geo.txt")
+    run(survey_folder, tmp_path / "out", "--weights", weights, *positions)
     poses = evaluate(tmp_path / "out", survey_folder / "truth").poses
     assert poses is not None
     assert poses.reference_from_estimate.scale == pytest.approx(1.0 / (2.0 * GAIN), rel=1e-3)

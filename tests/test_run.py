@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +11,11 @@ import numpy as np
 import pytest
 
 from onthefly3r import Options, reconstruct
-from onthefly3r.errors import Cancelled, GeoreferenceError, InputError, ReconstructionError
+from onthefly3r.batch import Flight, read_flights
+from onthefly3r.errors import Cancelled, GeoreferenceError, InputError, OptionError, ReconstructionError
 from onthefly3r.evaluate.run import evaluate
+from onthefly3r.intake.folder import read_photographs
+from onthefly3r.options import IntakeOptions
 from onthefly3r.protocol import Progress
 from onthefly3r.run import Result, export_again
 from onthefly3r.simulate import SurveyOptions, simulate_survey
@@ -22,6 +26,17 @@ FILES = (
     *(f"{name}{suffix}" for name in ("cameras", "footprints") for suffix in (".shp", ".shx", ".dbf", ".prj", ".cpg")),
     *(f"colmap/{name}.txt" for name in ("cameras", "images", "points3D")),
 )
+
+
+class Later:
+    """A cancel button that is pressed after it was looked at some times."""
+
+    def __init__(self, times: int) -> None:
+        self._left = times
+
+    def __call__(self) -> bool:
+        self._left -= 1
+        return self._left < 0
 
 
 @dataclass(frozen=True)
@@ -114,14 +129,57 @@ def test_without_positions_the_report_says_why_and_local_works(case: Case, tmp_p
     report = json.loads((tmp_path / "none" / "report.json").read_text(encoding="utf-8"))
     assert report["georeference"] is None and "position" in report["error"]
     assert not (tmp_path / "none" / "cloud.laz").exists()
-    local = export_again(case.out, tmp_path / "local", Options.from_flat({"local": True}))
+    unknown = {"local": True, "positions": str(tmp_path / "geo.txt")}
+    local = export_again(case.out, tmp_path / "units", Options.from_flat(unknown))
     assert local.cloud is not None and local.report["georeference"] is None
+    assert "not metres" in local.report["warnings"][0]
+
+
+def test_local_coordinates_are_metres_where_positions_tell(case: Case, tmp_path: Path) -> None:
+    """The scale is that of twelve positions of 1.5 m (1 sigma) over 90 m."""
+    local = export_again(case.out, tmp_path, Options.from_flat({"local": True}))
+    assert local.report["georeference"] is None and local.report["warnings"] == []
+    report = evaluate(tmp_path, case.truth, align="se3")
+    assert report.poses is not None and report.poses.ate < 2.0
 
 
 def test_cancelling_ends_the_run(case: Case, tmp_path: Path) -> None:
     with pytest.raises(Cancelled):
         reconstruct(case.photos, tmp_path / "out", Options.from_flat(FAST), cancel=lambda: True)
     assert not (tmp_path / "out" / "cloud.laz").exists()
+
+
+def test_a_crs_that_will_not_do_is_told_before_the_work(case: Case, tmp_path: Path) -> None:
+    for crs in ("EPSG:4326", "banana", "EPSG:2193"):  # not projected, unknown, of New Zealand
+        with pytest.raises(OptionError, match="crs"):
+            reconstruct(case.photos, tmp_path / "out", Options.from_flat({**FAST, "crs": crs}))
+        with pytest.raises(OptionError, match="crs"):
+            export_again(case.out, tmp_path / "out", Options.from_flat({"crs": crs}))
+        assert not (tmp_path / "out").exists()
+
+
+def test_nothing_of_an_earlier_result_passes_for_the_next(case: Case, tmp_path: Path) -> None:
+    """An export that fails, and a run that is cancelled, after which the folder serves again."""
+    export_again(case.out, tmp_path, Options())
+    with pytest.raises(ReconstructionError, match="no points"):
+        export_again(case.out, tmp_path, Options.from_flat({"min_confidence": 1.0}))
+    assert not (tmp_path / "cloud.laz").exists() and not (tmp_path / "preview.png").exists()
+    export_again(case.out, tmp_path, Options())
+    for _ in range(2):
+        with pytest.raises(Cancelled):
+            reconstruct(case.photos, tmp_path, Options.from_flat(FAST), cancel=Later(2))
+        assert not [path.name for path in tmp_path.iterdir() if path.is_file()]
+        assert (tmp_path / "work" / "features").exists()
+
+
+def test_results_among_the_photographs_are_no_photographs(case: Case) -> None:
+    out = case.photos / "result"
+    export_again(case.out, out, Options())
+    assert (out / "preview.png").exists()
+    shots, refused = read_photographs(case.photos, IntakeOptions(), leave_out=out)
+    assert len(shots) + len(refused) == 14  # as without the results
+    assert read_flights(case.photos, leave_out=out) == [Flight("weitere", case.photos / "weitere")]
+    shutil.rmtree(out)
 
 
 def test_photographs_that_share_nothing_end_with_a_report(tmp_path: Path) -> None:

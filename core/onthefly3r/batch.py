@@ -63,13 +63,14 @@ class FlightResult:
     report: str | None = None
 
 
-def read_flights(source: Path) -> list[Flight]:
+def read_flights(source: Path, leave_out: Path | None = None) -> list[Flight]:
     """Return the flights of a parent folder (its sub-folders with photographs) or of a table (CSV).
 
     The table needs a column `photos` (folders, relative to the table); `name` and columns named like options are
-    taken where there are any, empty cells leave the default. Raises `InputError`.
+    taken where there are any, empty cells leave the default. `leave_out` is no flight: the folder of results. Raises
+    `InputError`.
     """
-    flights = _from_folder(source) if source.is_dir() else _from_table(source)
+    flights = _from_folder(source, leave_out) if source.is_dir() else _from_table(source)
     names = Counter(flight.name.casefold() for flight in flights)  # some systems take A and a for the same folder
     name, times = names.most_common(1)[0]
     if times > 1:
@@ -123,8 +124,10 @@ def write_table(path: Path, rows: Sequence[FlightResult]) -> None:
 # ---------------------------------------------------------------------- which flights
 
 
-def _from_folder(parent: Path) -> list[Flight]:
-    folders = sorted(path for path in parent.iterdir() if path.is_dir() and not path.name.startswith("."))
+def _from_folder(parent: Path, leave_out: Path | None) -> list[Flight]:
+    results = None if leave_out is None else leave_out.resolve()
+    inner = (path for path in parent.iterdir() if path.is_dir() and not path.name.startswith("."))
+    folders = sorted(path for path in inner if path.resolve() != results)
     flights = [Flight(folder.name, folder) for folder in folders if find_photographs(folder, recursive=True)]
     if not flights:
         raise InputError(f"{parent}: none of its sub-folders holds photographs; each flight needs one of its own")

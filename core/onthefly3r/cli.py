@@ -96,7 +96,9 @@ def batch(
         options = run_options(values)
         from .batch import read_flights, reconstruct_flights
 
-        rows = reconstruct_flights(read_flights(flights), out, options, skip_done, here.progress, here.cancelled)
+        rows = reconstruct_flights(
+            read_flights(flights, leave_out=out), out, options, skip_done, here.progress, here.cancelled
+        )
         data = {"table": str(out / "flights.csv"), "flights": [asdict(row) for row in rows]}
         here.reporter.result(data, columns({row.flight: f"{row.status} {row.message}".strip() for row in rows}))
 

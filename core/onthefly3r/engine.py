@@ -238,15 +238,14 @@ class Engine:
         return False
 
     def _commit_seed(self, seed: tuple[int, ...]) -> bool:
-        subset = Subset(references=(), new=seed)
-        model = self._infer(subset)
+        subset, model = self._infer(Subset(references=(), new=seed))
         if isinstance(model, Rejection):
             return False
         threshold = self._backbone.spec.confidence_threshold
         refused = check_seed(model.views, threshold) if self._validates_queries else {}
-        good = [i for i in seed if i in model.views and i not in refused]
+        good = [i for i in subset.new if i in model.views and i not in refused]
         spacing = scene_spacing({i: model.views[i] for i in good}, threshold)
-        seen = len(seed) - len(model.left_out)
+        seen = len(subset.new) - len(model.left_out)
         if len(good) < max(3, MIN_SEED_SHARE * seen) or not spacing > 0.0:
             return False
         self.state.set_spacing(spacing)
@@ -261,7 +260,7 @@ class Engine:
             numbers = {"references": float(len(subset.references))}
             self._set_aside_images(Rejection(subset.new, "retrieval", "no similar images in the map", numbers))
             return
-        outcome, model = self._reconstruct_and_register(subset)
+        subset, outcome, model = self._reconstruct_and_register(subset)
         if isinstance(outcome, Rejection) or model is None:
             if isinstance(outcome, Rejection):
                 self._set_aside_images(outcome)
@@ -308,11 +307,14 @@ class Engine:
             support = self._frontier.support(window, references, self._index)
             return build_subset(window, neighbours, similar, options, support)
 
-    def _reconstruct_and_register(self, subset: Subset) -> tuple[Registration | Rejection, LocalModel | None]:
-        """Infer, register and validate; with context tokens, drop incompatible references and infer once more."""
-        model = self._infer(subset)
+    def _reconstruct_and_register(self, subset: Subset) -> tuple[Subset, Registration | Rejection, LocalModel | None]:
+        """Infer, register and validate; with context tokens, drop incompatible references and infer once more.
+
+        The subset that comes back lacks the images that are waiting again, or are gone.
+        """
+        subset, model = self._infer(subset)
         if isinstance(model, Rejection):
-            return model, None
+            return subset, model, None
         subset = self._put_back(subset, model.left_out)
         outcome = self._register(model, subset)
         if isinstance(outcome, Rejection) and self._backbone.spec.has_tokens and self.options.registration.validation:
@@ -320,11 +322,11 @@ class Engine:
             dropped = incompatible_references(subset, model.views, minimum)
             if dropped:
                 subset = replace(subset, references=tuple(i for i in subset.references if i not in dropped))
-                again = self._infer(subset)
+                subset, again = self._infer(subset)
                 if isinstance(again, LocalModel):
                     subset = self._put_back(subset, again.left_out)
-                    return self._register(again, subset), again
-        return outcome, model
+                    return subset, self._register(again, subset), again
+        return subset, outcome, model
 
     def _without_orphans(self, outcome: Registration, subset: Subset) -> Registration | Rejection:
         """Refuse the new images whose own references were pruned: nothing kept speaks for where they are."""
@@ -343,10 +345,22 @@ class Engine:
         self._waiting = [*left_out, *self._waiting]
         return replace(subset, new=tuple(i for i in subset.new if i not in left_out))
 
-    def _infer(self, subset: Subset) -> LocalModel | Rejection:
-        self.backbone_calls += 1
-        with self.stopwatch.stage("backbone"):
-            return self._backbone.reconstruct(subset, self._images, self.state.calibrations)
+    def _infer(self, subset: Subset) -> tuple[Subset, LocalModel | Rejection]:
+        """Return the local model of a subset without the photographs that cannot be read any more, and that subset."""
+        while subset.new:
+            self.backbone_calls += 1
+            try:
+                with self.stopwatch.stage("backbone"):
+                    return subset, self._backbone.reconstruct(subset, self._images, self.state.calibrations)
+            except PhotographError as error:
+                gone = tuple(i for i in subset.members if self.shots[i].name == error.image)
+                if not gone:
+                    raise
+                self._reject(tuple(i for i in gone if i in subset.new), "intake", error.reason, {})
+                self._waiting = [i for i in self._waiting if i not in gone]
+                references, new = (tuple(i for i in part if i not in gone) for part in (subset.references, subset.new))
+                subset = Subset(references, new)
+        return subset, Rejection((), "intake", "no photograph of the subset can be read any more", {})
 
     def _register(self, model: LocalModel, subset: Subset) -> Registration | Rejection:
         with self.stopwatch.stage("registration"):
@@ -431,7 +445,7 @@ class Engine:
 
     def _checkpoint(self, stage: str, done: int, total: int) -> None:
         if self._cancel is not None and self._cancel():
-            raise Cancelled("stopped on request; what was placed so far is in the work folder")
+            raise Cancelled("stopped on request; run again to start anew")
         if self._progress is None:
             return
         placed, rejected = len(self.state.frames), len(self.rejections)

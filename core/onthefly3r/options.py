@@ -193,9 +193,11 @@ class GeoreferenceOptions:
         choices=("auto", "ellipsoidal", "egm96", "egm2008"),
     )
     positions: str | None = option(
-        None, "position file (geo.txt: a CRS, then name x y z per line); replaces the positions in the tags"
+        None,
+        "position file (geo.txt: a CRS, then name x y z per line, perhaps yaw pitch roll in degrees, pitch 0 looks "
+        "down); replaces the positions in the tags",
     )
-    local: bool = option(False, "write map units without a CRS when positions are missing or not asked for")
+    local: bool = option(False, "write local coordinates without a CRS, in metres where positions tell the scale")
     gps_sigma_h_m: float = option(3.0, "horizontal accuracy of positions without their own", unit="m", minimum=0.001)
     gps_sigma_v_m: float = option(5.0, "vertical accuracy of positions without their own", unit="m", minimum=0.001)
 

@@ -40,11 +40,11 @@ class ExportFrame:
     world: WorldFrame | None  # None: coordinates stay in the levelled map
 
     @classmethod
-    def of(cls, reference: GeoReference | None, up: Float | None) -> ExportFrame:
-        """Return the frame of a georeference; without one, the map turned so that `up` points up."""
+    def of(cls, reference: GeoReference | None, up: Float | None, scale: float = 1.0) -> ExportFrame:
+        """Return the frame of a georeference; without one, the map turned so that `up` points up, and scaled."""
         if reference is not None:
             return cls(reference.enu_from_map, world_frame(reference))
-        return cls(Sim3(1.0, _turning_up(up), np.zeros(3)), None)
+        return cls(Sim3(scale, _turning_up(up), np.zeros(3)), None)
 
     @property
     def wkt(self) -> str | None:
@@ -73,6 +73,17 @@ class ExportFrame:
             return 0.0
         turn = self.world.rotation_world_from_enu(self.level_from_map.apply(map_from_cam.translation))
         return float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
+
+
+def remove_products(out: Path) -> None:
+    """Remove the files of an earlier result, so that none can pass for one of the next, which may fail."""
+    tables = (
+        f"{name}.{suffix}" for name in ("cameras", "footprints") for suffix in ("shp", "shx", "dbf", "prj", "cpg")
+    )
+    model = (f"colmap/{name}.{suffix}" for name in ("cameras", "images", "points3D") for suffix in ("txt", "bin"))
+    single = ("cloud.las", "cloud.laz", "trajectory.csv", "preview.png", "report.json", "report.html")
+    for name in (*single, *tables, *model):
+        (out / name).unlink(missing_ok=True)
 
 
 def write_products(

@@ -19,24 +19,23 @@ from .export.clip import read_rings
 from .export.las import CloudSummary
 from .export.page import write_page
 from .export.report import RejectedImage, RunSummary, Timing, build_report, write_report
-from .geometry.transforms import Rigid3
 from .intake.folder import read_photographs
 from .intake.images import load_working_image
 from .intake.positions_file import read_positions, with_positions
-from .mapping.georef import georeference
+from .mapping.georef import check_crs, georeference, metres_per_map_unit
 from .mapping.ground import ground_normal
 from .mapping.journal import shot_from_json, shot_to_json
 from .mapping.state import MapState
 from .mapping.store import Store
 from .options import Options, slice_classes
-from .products import ExportFrame, write_products
+from .products import ExportFrame, remove_products, write_products
 from .protocol import Progress, ProgressCallback
 from .records import GeoReference, RefusedPhotograph, Rejection, Shot
 from .selection.choice import create_describer
 from .stopwatch import Stopwatch, peak_rss_mib
 
 MAX_RUN_FILE_BYTES = 256 * 1024 * 1024
-PRODUCTS = ("cloud.las", "cloud.laz", "trajectory.csv", "preview.png", "report.json", "report.html")
+RUN_FILES = ("features", "chunks", "journal.jsonl", "run.json", "crash.txt")  # in OUT/work
 
 
 @dataclass(frozen=True)
@@ -87,8 +86,9 @@ def reconstruct(
     backbone = create_backbone(options.backbone, features)
     describer = create_describer(options.selection, features, options.backbone.device)
     with stopwatch.stage("intake"):
-        shots, refused = read_photographs(photos, options.intake)
+        shots, refused = read_photographs(photos, options.intake, leave_out=out)
         shots = _with_positions(shots, options)
+        check_crs(dict(enumerate(shots)), options.georeference)
     work = _fresh_work_folder(out)
     engine = Engine(
         work,
@@ -104,7 +104,7 @@ def reconstruct(
         engine.add_all(shots)
         engine.finish()
     shutil.rmtree(work / "features", ignore_errors=True)
-    write_text(work / "run.json", json.dumps(_run_to_json(engine, backbone.spec.facts(), refused), ensure_ascii=False))
+    write_text(work / "run.json", json.dumps(_run_to_json(engine, backbone.spec.facts(), refused)))
     outcome = _Outcome(
         engine.shots,
         engine.rejections,
@@ -144,7 +144,9 @@ def export_again(
     outcome = _read_run(run / "work" / "run.json")
     placed_anew = _with_positions([shot for _, shot in sorted(outcome.shots.items())], options)
     outcome = replace(outcome, shots=dict(zip(sorted(outcome.shots), placed_anew, strict=True)))
+    check_crs(outcome.shots, options.georeference)
     out.mkdir(parents=True, exist_ok=True)
+    remove_products(out)
     return _finish(out, out / "work", state, store, outcome, options, stopwatch, progress, None)
 
 
@@ -153,16 +155,16 @@ def earlier_options(run: Path) -> dict[str, Any]:
 
     Left out are its files: positions stay with the photographs of the run, and a boundary need not be there any more.
     """
-    path = Path(run) / "report.json"
+    path = Path(run) / "work" / "run.json"
     try:
         if path.stat().st_size > MAX_RUN_FILE_BYTES:
             raise ValueError(f"larger than {MAX_RUN_FILE_BYTES} bytes")
-        told = json.loads(path.read_text(encoding="utf-8"))["software"]["options"]
+        told = json.loads(path.read_text(encoding="utf-8"))["options"]
         slices = slice_classes()
         names = {item.name for name in ("georeference", "export") for item in fields(slices[name])}
         return {name: told[name] for name in names - {"positions", "boundary", "cloud"} if name in told}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path} is no report of a run ({error}); name the output folder of a run") from error
+        raise InputError(f"{path} is no record of a run ({error}); name the output folder of a run") from error
 
 
 def _finish(
@@ -180,13 +182,15 @@ def _finish(
     cloud: CloudSummary | None = None
     reference: GeoReference | None = None
     failure: ReconstructionError | None = None
+    scale = 1.0
+    warnings = list(outcome.warnings)
     placed, rejected = len(state.frames), len(outcome.rejections) + len(outcome.refused)
 
     def checkpoint(stage: str, done: int, total: int) -> None:
         from .errors import Cancelled
 
         if cancel is not None and cancel():
-            raise Cancelled("stopped on request; what was placed so far is in the work folder")
+            raise Cancelled("stopped on request; run again to start anew")
         if progress is not None:
             progress(Progress(stage, done, total, placed, rejected, 0))
 
@@ -199,8 +203,14 @@ def _finish(
         with stopwatch.stage("georeference"):
             checkpoint("georeferencing", 0, 1)
             up = ground_normal(state)
-            if not options.georeference.local:
-                reference = _georeference(state, outcome.shots, options, up)
+            poses = {index: state.map_from_cam(index) for index in state.frames}
+            if options.georeference.local:
+                known = metres_per_map_unit(poses, outcome.shots, options.georeference)
+                scale = known or scale
+                if known is None:
+                    warnings.append("no positions tell the scale: the units of the local frame are not metres")
+            else:
+                reference = georeference(poses, outcome.shots, options.georeference, up)
         with stopwatch.stage("export"):
             cloud = write_products(
                 out,
@@ -211,7 +221,7 @@ def _finish(
                 outcome.rejections,
                 outcome.retries,
                 reference,
-                ExportFrame.of(reference, up),
+                ExportFrame.of(reference, up, scale),
                 options,
                 out.resolve().name,
                 checkpoint,
@@ -228,7 +238,7 @@ def _finish(
         georeference=reference,
         cloud=cloud,
         error=str(failure) if failure else None,
-        warnings=outcome.warnings,
+        warnings=warnings,
         details=outcome.details,
         backbone_facts=outcome.backbone_facts,
         stage_memory=stopwatch.memory,
@@ -248,11 +258,6 @@ def _finish(
     )
 
 
-def _georeference(state: MapState, shots: dict[int, Shot], options: Options, up: Any) -> GeoReference:
-    poses: dict[int, Rigid3] = {index: state.map_from_cam(index) for index in state.frames}
-    return georeference(poses, shots, options.georeference, up)
-
-
 def _with_positions(shots: list[Shot], options: Options) -> list[Shot]:
     file = options.georeference.positions
     return shots if file is None else with_positions(shots, read_positions(Path(file)))
@@ -263,13 +268,13 @@ def _fresh_work_folder(out: Path) -> Path:
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a folder for the results")
     work = out / "work"
-    if out.exists() and any(out.iterdir()) and not (work / "journal.jsonl").exists():
-        taken = [p.name for p in out.iterdir() if p.name not in (*PRODUCTS, "work", "colmap")]
-        if taken and not (out / "report.json").exists():
+    earlier = (out / "report.json").exists() or any((work / name).exists() for name in RUN_FILES)
+    if not earlier and out.exists():
+        taken = [p.name for p in out.iterdir() if p.name != "work" or any(p.iterdir())]
+        if taken:
             raise InputError(f"{out}: is not empty (it holds {taken[0]}) and no earlier result; name another folder")
-    for name in PRODUCTS:
-        (out / name).unlink(missing_ok=True)
-    if (work / "journal.jsonl").exists() or (work / "features").exists():
+    remove_products(out)
+    if any((work / name).exists() for name in RUN_FILES):
         shutil.rmtree(work)
     work.mkdir(parents=True, exist_ok=True)
     return work
@@ -287,6 +292,7 @@ def _run_to_json(
     engine: Engine, backbone_facts: dict[str, Any], refused: Sequence[RefusedPhotograph]
 ) -> dict[str, Any]:
     return {
+        "options": engine.options.to_flat(),
         "backbone": engine.backbone_name,
         "backbone_facts": backbone_facts,
         "details": engine.details(),

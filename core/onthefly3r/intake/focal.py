@@ -10,7 +10,6 @@ from importlib.resources import files
 from .tags import Tags
 
 FILM_DIAGONAL_MM = 43.27  # of the 36 x 24 mm frame that 35-mm equivalents refer to (CIPA DCG-001)
-FILM_WIDTH_MM = 36.0
 GUESS_RATIO, GUESS_SIGMA = 0.85, 0.30
 SENSOR_SIGMA, EQUIVALENT_SIGMA = 0.05, 0.07
 WIDE_ASPECT = 1.6  # beyond this a photograph is taken for a crop of a 4:3 sensor that kept its full width

@@ -16,7 +16,9 @@ from .metadata import read_shot
 from .opening import SUFFIXES
 
 
-def read_photographs(folder: Path, options: IntakeOptions) -> tuple[list[Shot], list[RefusedPhotograph]]:
+def read_photographs(
+    folder: Path, options: IntakeOptions, leave_out: Path | None = None
+) -> tuple[list[Shot], list[RefusedPhotograph]]:
     """Return the shots of a folder by capture time then name, and the files that were refused.
 
     Shots without a capture time come last. `options.limit` cuts in capture order, before any shuffling.
@@ -24,7 +26,7 @@ def read_photographs(folder: Path, options: IntakeOptions) -> tuple[list[Shot], 
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the folder that holds the photographs")
-    paths = find_photographs(folder, options.recursive)
+    paths = find_photographs(folder, options.recursive, leave_out)
     if not paths:
         where = "it or its sub-folders" if options.recursive else "it (sub-folders are not searched)"
         raise InputError(f"{folder}: no JPEG, PNG or TIFF file in {where}")
@@ -47,11 +49,16 @@ def read_photographs(folder: Path, options: IntakeOptions) -> tuple[list[Shot], 
     return shots, [refused[name] for name in sorted(refused)]
 
 
-def find_photographs(folder: Path, recursive: bool) -> list[Path]:
-    """Return the files with a photograph's suffix, sorted by name; hidden files and folders are left out."""
+def find_photographs(folder: Path, recursive: bool, leave_out: Path | None = None) -> list[Path]:
+    """Return the files with a photograph's suffix, sorted by name.
+
+    Hidden files and folders are left out, and the folder `leave_out`: results that lie among the photographs.
+    """
     found: list[Path] = []
+    results = None if leave_out is None else leave_out.resolve()
     for parent, folders, names in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith(".")) if recursive else []
+        inner = sorted(name for name in folders if not name.startswith(".") and Path(parent, name).resolve() != results)
+        folders[:] = inner if recursive else []
         found += [
             Path(parent, name)
             for name in names

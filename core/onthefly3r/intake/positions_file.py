@@ -32,8 +32,9 @@ class FilePosition:
 def read_positions(path: Path) -> list[FilePosition]:
     """Read a `geo.txt`: first line a CRS, then `name x y [z] [yaw pitch roll] [sigma_h sigma_v]`, `#` for comments.
 
-    Angles need seven columns, accuracies nine; heights are taken for what the option `vertical` says. Raises
-    `ReferenceFormatError` with the line.
+    Angles need seven columns, accuracies nine. Angles are degrees as OpenDroneMap reads them: pitch is 0 for a camera
+    that looks down and 90 for one that looks to the horizon. Heights are taken for what the option `vertical` says.
+    Raises `ReferenceFormatError` with the line.
     """
     from pyproj import Transformer
 
@@ -114,5 +115,8 @@ def _position(line: str, where: str, to_lon_lat: Callable[[float, float], tuple[
         raise ReferenceFormatError(f"{where}: {numbers[0]}, {numbers[1]} is no place in the CRS of the first line")
     height = numbers[2] if len(numbers) > 2 else None
     sigma_h, sigma_v = (numbers[6], numbers[7]) if len(numbers) == 8 else (None, None)
-    attitude = Attitude(*numbers[3:6]) if len(numbers) >= 6 else None
+    attitude = None
+    if len(numbers) >= 6:
+        yaw_deg, pitch_deg, roll_deg = numbers[3:6]
+        attitude = Attitude(yaw_deg, pitch_deg - 90.0, roll_deg)  # here 0 looks down, in tags of gimbals -90 does
     return FilePosition(name.strip(), GpsFix(lat, lon, height, "unknown", sigma_h, sigma_v), attitude)

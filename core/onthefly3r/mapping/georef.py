@@ -27,6 +27,8 @@ MIN_POSITIONS = 3
 LINE_RATIO = 0.02  # sideways over lengthwise extent of camera centres that count as one line
 MAX_ROLL_SIGMA_DEG = 15.0  # what positions must tell about the level in its worst direction to do without gimbal
 GIMBAL = "gimbal angles"
+MOST_SCALED = 500  # positions whose distances tell the scale of a local frame,
+FAR_SIGMAS = 5.0  # those that are this much longer than positions are wrong
 
 
 def georeference(
@@ -53,7 +55,7 @@ def georeference(
     images = sorted(map_from_cam)
     positions = usable_positions(images, shots, options)
     _require_enough(positions, len(images))
-    crs = _target_crs(options, positions.frame)
+    crs = _target_crs(options, positions)
     first_up, witnesses = up_witnesses(map_from_cam, shots, ground_normal)
     centres = np.array([map_from_cam[i].translation for i in positions.images])
     solution = fit(centres, positions, first_up, witnesses, seed)
@@ -117,12 +119,40 @@ def _require_trustworthy(solution: LevelFit, centres: Float, witnesses: list[UpW
         )
 
 
-def _target_crs(options: GeoreferenceOptions, frame: EnuFrame) -> str:
+def metres_per_map_unit(
+    map_from_cam: Mapping[int, Rigid3], shots: Mapping[int, Shot], options: GeoreferenceOptions
+) -> float | None:
+    """Return what the positions say of the map's scale, None where they are too few or too close together.
+
+    The median over pairs of cameras, so that neither the level nor a few wrong positions matter.
+    """
+    positions = usable_positions(sorted(map_from_cam), shots, options)
+    if positions.distinct < MIN_POSITIONS:
+        return None
+    chosen = np.linspace(0, len(positions.images) - 1, min(len(positions.images), MOST_SCALED)).astype(int)
+    first, second = np.triu_indices(len(chosen), 1)
+    enu = positions.enu[chosen, :2]
+    centres = np.array([map_from_cam[positions.images[k]].translation for k in chosen])
+    metres, units = (np.linalg.norm(points[first] - points[second], axis=1) for points in (enu, centres))
+    far = (metres > FAR_SIGMAS * float(np.median(positions.sigma_h_m))) & (units > 0.0)
+    return float(np.median(metres[far] / units[far])) if far.any() else None
+
+
+def check_crs(shots: Mapping[int, Shot], options: GeoreferenceOptions) -> None:
+    """Raise `OptionError` now if the CRS that is asked for cannot be used where the photographs were taken."""
+    if options.crs is not None and not options.local:
+        _target_crs(options, usable_positions(sorted(shots), shots, options))
+
+
+def _target_crs(options: GeoreferenceOptions, positions: Positions) -> str:
     from pyproj.exceptions import ProjError
 
+    frame = positions.frame
     if options.crs is None:
         return utm_crs_for(frame.lat_deg, frame.lon_deg)
     projected_crs(options.crs)
+    if not positions.images:
+        return options.crs
     transformation_accuracy_m(options.crs, frame.lat_deg, frame.lon_deg)
     try:
         there = WorldFrame(options.crs, "ellipsoidal", frame)

@@ -43,7 +43,6 @@ class Store:
         self._journal = work / "journal.jsonl"
         self._chunk_of: dict[int, int] = {}
         self._recent: OrderedDict[int, CompactReference] = OrderedDict()
-        self._chunks.mkdir(parents=True, exist_ok=True)
 
     def commit(self, submap: Submap, frames: Sequence[NewFrame], observations: Observations | None = None) -> None:
         """Write one batch: the chunk first, then the journal line that makes it count."""
@@ -58,9 +57,13 @@ class Store:
             arrays[f"{prefix}/confidence"] = new.confidence
         if observations is not None:
             arrays |= {f"observations/{name}": value for name, value in vars(observations).items()}
+        self._chunks.mkdir(parents=True, exist_ok=True)
         path = self._chunk_path(submap.number)
         temporary = path.with_suffix(".part.npz")
-        np.savez(temporary, **arrays)
+        with temporary.open("wb") as stream:
+            np.savez(stream, **arrays)
+            stream.flush()
+            os.fsync(stream.fileno())  # the journal must not name what a power cut took
         temporary.replace(path)
         self.note("submap", submap_to_json(submap))
         for new in frames:
@@ -69,8 +72,9 @@ class Store:
 
     def note(self, kind: str, value: Any) -> None:
         """Append one line to the journal and wait until it is on disk."""
+        self._journal.parent.mkdir(parents=True, exist_ok=True)
         with self._journal.open("a", encoding="utf-8") as journal:
-            journal.write(json.dumps({kind: value}, ensure_ascii=False) + "\n")
+            journal.write(json.dumps({kind: value}) + "\n")
             journal.flush()
             os.fsync(journal.fileno())
 
