@@ -44,6 +44,16 @@ def test_view_that_misses_the_ground_has_none(pitch_deg: float, ground_z_m: floa
     assert footprint(placed("a.jpg", 0.0, 0.0, pitch_deg), ground_z_m) is None
 
 
+def test_names_that_a_shapefile_cannot_hold_are_shortened(tmp_path: Path) -> None:
+    found = [footprint(placed(name, 0.0, 0.0), 100.0) for name in ("ü" * 300 + "/DJI_0001.JPG", "b\udcff.jpg")]
+    write_footprints(tmp_path / "footprints.shp", [f for f in found if f], None)
+    with shapefile.Reader(str(tmp_path / "footprints.shp")) as reader:
+        long, undecodable = (record["image"] for record in reader.records())
+    assert long.startswith("...ü")
+    assert long.endswith("ü/DJI_0001.JPG")
+    assert undecodable == "b?.jpg"
+
+
 def test_overlap_counts_who_covers_the_centre(tmp_path: Path) -> None:
     cameras = [placed("a.jpg", 0.0, 0.0), placed("b.jpg", 30.0, 0.0), placed("ö.jpg", 500.0, 0.0)]
     found = with_overlap([f for f in (footprint(c, 100.0) for c in cameras) if f])

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from html.parser import HTMLParser
+from pathlib import Path
 
-from onthefly3r.export.page import page
+from onthefly3r.export.page import page, write_page
 from onthefly3r.export.report import RejectedImage, RunSummary, Timing, build_report
 from onthefly3r.options import Options
 
@@ -43,6 +44,15 @@ def test_page_tells_rejections_and_escapes_names() -> None:
     assert bad.image in text
     assert bad.reason in text
     assert "No placed photograph looks alike" in text
+
+
+def test_page_with_an_undecodable_name_is_written(tmp_path: Path) -> None:
+    bad = RejectedImage("DJI_\udcff.jpg", "intake", "damaged")
+    report = build_report(RunSummary(Options(), "classical 1", 3, 2, [bad], Timing(4.0, 1.0)), None)
+    write_page(tmp_path / "report.html", report, "flight \udcfe")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "DJI_\\udcff.jpg" in text
+    assert "flight \\udcfe" in text
 
 
 def test_page_names_weights_licence_and_gpu_memory() -> None:

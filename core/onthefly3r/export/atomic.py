@@ -32,6 +32,6 @@ def replacing(path: Path, companions: Sequence[str] = ()) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text with line feeds atomically."""
+    """Write UTF-8 text with line feeds atomically; undecodable file names become \\udcxx escapes (valid in JSON)."""
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")

@@ -12,7 +12,7 @@ from ..geometry.arrays import Float
 from ..records import PlacedCamera
 from .atomic import replacing
 from .clip import in_ring
-from .vector import esri_wkt
+from .vector import esri_wkt, fit_text
 
 # Oblique views see to the horizon: a footprint ends where the ground is this many flying heights away.
 MAX_REACH = 4.0
@@ -82,7 +82,7 @@ def write_footprints(path: Path, footprints: Iterable[Footprint], crs: str | Non
             for item in footprints:
                 ring = _clockwise(item.outline)
                 writer.poly([[*ring.tolist(), ring[0].tolist()]])
-                writer.record(item.image[-254:], item.gsd_m, item.area_m2, item.overlap)
+                writer.record(fit_text(item.image, 254, keep_end=True), item.gsd_m, item.area_m2, item.overlap)
                 count += 1
         temporary.with_suffix(".cpg").write_text("UTF-8", encoding="ascii")
         if crs is None:

@@ -12,7 +12,7 @@ from typing import Any
 from .. import __version__
 from ..options import Options
 from ..records import GeoReference
-from .atomic import replacing
+from .atomic import write_text
 from .las import CloudSummary
 
 
@@ -106,9 +106,7 @@ def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
     """Write the report as strict JSON (no NaN), UTF-8, atomically."""
     text = json.dumps(_plain(report), indent=2, ensure_ascii=False, allow_nan=False)
-    with replacing(path) as temporary:
-        # Undecodable file names become \udcxx escapes, which are valid JSON.
-        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace", newline="\n")
+    write_text(path, text + "\n")
 
 
 def _plain(value: Any) -> Any:

@@ -83,11 +83,14 @@ def esri_wkt(crs: str) -> str:
 
 def _record(row: CameraRow) -> list[object]:
     values = ((getattr(row, name), name, kind, width) for name, kind, width, _ in FIELDS)
-    return [_fit(value, width, name == "image") if kind == "C" else value for value, name, kind, width in values]
+    return [fit_text(value, width, name == "image") if kind == "C" else value for value, name, kind, width in values]
 
 
-def _fit(text: str, width: int, keep_end: bool) -> str:
-    """Shorten text to `width` bytes of UTF-8; of a file name the end is kept, because that tells names apart."""
+def fit_text(text: str, width: int, keep_end: bool) -> str:
+    """Return text of at most `width` bytes of UTF-8, with ? for what cannot be written.
+
+    Of a file name the end is kept, because that tells names apart.
+    """
     data = text.strip().encode("utf-8", errors="replace")
     if len(data) > width:
         data = b"..." + data[3 - width :] if keep_end else data[: width - 3] + b"..."
