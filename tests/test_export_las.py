@@ -109,6 +109,13 @@ def test_header_bytes_follow_the_standard(tmp_path: Path, name: str) -> None:
     assert records["LASF_Spec", 3] == b"a note\0"
 
 
+def test_the_name_of_a_folder_that_cannot_be_decoded_is_escaped(tmp_path: Path) -> None:
+    write_cloud(tmp_path / "cloud.las", tiles(), None, 0.001, "flight \udcff")
+    with laspy.open(tmp_path / "cloud.las") as reader:
+        texts = [vlr.record_data for vlr in reader.header.vlrs if vlr.record_id == 3]
+    assert texts == [b"flight \\udcff\0"]
+
+
 def test_without_crs_a_local_one_is_written(tmp_path: Path) -> None:
     write_cloud(tmp_path / "cloud.laz", tiles(), None, 0.001)
     with laspy.open(tmp_path / "cloud.laz") as reader:

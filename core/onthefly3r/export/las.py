@@ -122,7 +122,7 @@ def _header(offset: Float, scale_m: float, wkt1: str, description: str, wide: bo
     header.vlrs.append(WktCoordinateSystemVlr(wkt1))
     header.global_encoding.wkt = True
     if description:
-        text = description.encode("utf-8")[:65_000] + b"\0"
+        text = description.encode("utf-8", errors="backslashreplace")[:65_000] + b"\0"
         header.vlrs.append(laspy.VLR("LASF_Spec", 3, "Text area description", text))
     return header
 
