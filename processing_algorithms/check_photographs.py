@@ -39,6 +39,7 @@ CHECKED_FIELDS = (
     *((name, WHOLE) for name in ("width_px", "height_px")),
     *((name, TEXT) for name in ("camera", "focal_source")),
 )
+EXPECTED_FIELDS = tuple(field for field in FOOTPRINT_FIELDS if field[0] != "number")  # a run gives the numbers
 NUMBERS = {
     "GIVEN": ("given", "Photographs given"),
     "GOOD": ("good", "Good photographs"),
@@ -125,7 +126,7 @@ class CheckPhotographs(CoreAlgorithm):
             (CHECKED, CHECKED_FIELDS, QgsWkbTypes.Type.PointZ, map(point_row, rows), "checked.qml"),
             (
                 FOOTPRINTS,
-                FOOTPRINT_FIELDS,
+                EXPECTED_FIELDS,
                 QgsWkbTypes.Type.Polygon,
                 (polygon_row(row) for row in rows if row["footprint"]),
                 "footprints.qml",

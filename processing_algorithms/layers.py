@@ -39,7 +39,9 @@ if Qgis.QGIS_VERSION_INT >= 33800:
 else:  # fields do not take QMetaType yet
     TEXT, REAL, WHOLE, TRUTH = QVariant.String, QVariant.Double, QVariant.Int, QVariant.Bool
 CAMERA_FIELDS = (
-    *((name, TEXT) for name in ("image", "status", "reason")),
+    ("image", TEXT),
+    ("number", WHOLE),
+    *((name, TEXT) for name in ("status", "reason")),
     *((name, REAL) for name in ("x", "y", "z", "omega", "phi", "kappa", "yaw", "pitch", "roll")),
     *((name, REAL) for name in ("gps_x", "gps_y", "gps_z", "dx", "dy", "dz", "d_h", "d_3d", "sig_h", "sig_v")),
     ("rtk", WHOLE),
@@ -56,7 +58,7 @@ REJECTED_FIELDS = (
     ("t_utc", TEXT),
     ("cam", TEXT),
 )
-FOOTPRINT_FIELDS = (("image", TEXT), ("gsd_m", REAL), ("area_m2", REAL), ("overlap", WHOLE))
+FOOTPRINT_FIELDS = (("image", TEXT), ("number", WHOLE), ("gsd_m", REAL), ("area_m2", REAL), ("overlap", WHOLE))
 
 Row = tuple[dict[str, Any], "QgsGeometry | None"]
 

@@ -19,9 +19,11 @@ from onthefly3r.records import PlacedCamera
 CAMERA = Camera(1600, 900, 800.0, 800.0, 800.0, 450.0)
 
 
-def placed(name: str, x: float, y: float, pitch_deg: float = -90.0, yaw_deg: float = 0.0) -> PlacedCamera:
+def placed(
+    name: str, x: float, y: float, pitch_deg: float = -90.0, yaw_deg: float = 0.0, index: int = 0
+) -> PlacedCamera:
     pose = Rigid3(enu_from_cam_rotation(yaw_deg, pitch_deg, 0.0), np.array([x, y, 140.0]))
-    return PlacedCamera(0, name, CAMERA, pose, 0)
+    return PlacedCamera(index, name, CAMERA, pose, 0)
 
 
 @given(st.floats(-180.0, 180.0))
@@ -55,7 +57,7 @@ def test_names_that_a_shapefile_cannot_hold_are_shortened(tmp_path: Path) -> Non
 
 
 def test_overlap_counts_who_covers_the_centre(tmp_path: Path) -> None:
-    cameras = [placed("a.jpg", 0.0, 0.0), placed("b.jpg", 30.0, 0.0), placed("ö.jpg", 500.0, 0.0)]
+    cameras = [placed("a.jpg", 0.0, 0.0), placed("b.jpg", 30.0, 0.0), placed("ö.jpg", 500.0, 0.0, index=6)]
     found = with_overlap([f for f in (footprint(c, 100.0) for c in cameras) if f])
     assert [f.overlap for f in found] == [2, 2, 1]
     assert write_footprints(tmp_path / "footprints.shp", found, "EPSG:32633") == 3
@@ -64,5 +66,6 @@ def test_overlap_counts_who_covers_the_centre(tmp_path: Path) -> None:
         records = [record.as_dict() for record in reader.records()]
         assert [len(shape.parts) for shape in reader.shapes()] == [1, 1, 1]
     assert [(r["image"], r["overlap"]) for r in records] == [("a.jpg", 2), ("b.jpg", 2), ("ö.jpg", 1)]
+    assert [r["number"] for r in records] == [1, 1, 7]  # shot index + 1
     assert records[0]["area_m2"] == pytest.approx(3600.0)
     assert "UTM" in (tmp_path / "footprints.prj").read_text(encoding="utf-8")

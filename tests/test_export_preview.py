@@ -87,9 +87,9 @@ def test_picture_shows_cloud_and_cameras_where_they_are(tmp_path: Path, suffix: 
     colours = np.full((len(points), 3), (60, 120, 40))
     colours[points[:, 0] > ORIGIN[0] + 40] = (200, 180, 160)  # east half
     cloud = write(tmp_path / f"cloud.{suffix}", points, colours)
-    rows = [CameraRow(f"{k}", "placed", x=ORIGIN[0] + 10 + 12 * k, y=ORIGIN[1] + 20, z=200.0) for k in range(6)]
-    rows.append(CameraRow("x", "rejected", gps_x=ORIGIN[0] + 70, gps_y=ORIGIN[1] + 35))
-    rows.append(CameraRow("nowhere", "rejected"))
+    rows = [CameraRow(f"{k}", k + 1, "placed", x=ORIGIN[0] + 10 + 12 * k, y=ORIGIN[1] + 20, z=200.0) for k in range(6)]
+    rows.append(CameraRow("x", 7, "rejected", gps_x=ORIGIN[0] + 70, gps_y=ORIGIN[1] + 35))
+    rows.append(CameraRow("nowhere", 8, "rejected"))
     write_preview(tmp_path / "preview.png", cloud, rows, "A survey", georeferenced=True)
 
     with Image.open(tmp_path / "preview.png") as picture:
@@ -111,7 +111,7 @@ def test_picture_shows_cloud_and_cameras_where_they_are(tmp_path: Path, suffix: 
 
 def test_one_camera_and_a_tiny_cloud(tmp_path: Path) -> None:
     cloud = write(tmp_path / "c.laz", ORIGIN + np.zeros((1, 3)), np.full((1, 3), 90))
-    rows = [CameraRow("a", "placed", x=ORIGIN[0], y=ORIGIN[1], z=5.0)]
+    rows = [CameraRow("a", 1, "placed", x=ORIGIN[0], y=ORIGIN[1], z=5.0)]
     write_preview(tmp_path / "preview.png", cloud, rows, "", georeferenced=False)
     with Image.open(tmp_path / "preview.png") as picture:
         assert picture.size[0] >= 640

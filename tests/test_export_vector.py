@@ -28,11 +28,11 @@ def shot(name: str, time_s: float | None = 1_700_000_000.25) -> Shot:
 
 def rows() -> list[CameraRow]:
     rotation = enu_from_cam_rotation(30.0, -90.0, 0.0)
-    placed = PlacedCamera(0, NAME, CAMERA, Rigid3(rotation, np.array([576_700.5, 5_188_100.25, 200.0])), 2)
+    placed = PlacedCamera(7, NAME, CAMERA, Rigid3(rotation, np.array([576_700.5, 5_188_100.25, 200.0])), 2)
     return [
         placed_row(placed, shot(NAME), gps=(576_698.5, 5_188_101.25, 202.0), sigma_h_m=0.5, used=True),
-        rejected_row(shot("b.jpg"), "too few matches: é " * 40, gps=(576_710.0, 5_188_120.0, None), retries=3),
-        rejected_row(shot("c.jpg", None), "no position"),
+        rejected_row(shot("b.jpg"), 9, "too few matches: é " * 40, gps=(576_710.0, 5_188_120.0, None), retries=3),
+        rejected_row(shot("c.jpg", None), 10, "no position"),
     ]
 
 
@@ -46,6 +46,7 @@ def test_shapefile_reads_back(tmp_path: Path) -> None:
     assert shapes[0].z[0] == 200.0
     first, second = records
     assert first["image"] == NAME
+    assert (first["number"], second["number"]) == (8, 9)  # index 7 and the next
     assert first["cam"] == "DJI FC300X é"
     assert (first["status"], first["used"], first["batch"], first["rtk"], first["retries"]) == (
         "placed",
@@ -68,7 +69,7 @@ def test_shapefile_reads_back(tmp_path: Path) -> None:
 
 
 def test_a_long_name_keeps_its_end(tmp_path: Path) -> None:
-    row = rejected_row(shot("ü" * 300 + "/DJI_0001.JPG"), "", gps=(0.0, 0.0, 0.0))
+    row = rejected_row(shot("ü" * 300 + "/DJI_0001.JPG"), 1, "", gps=(0.0, 0.0, 0.0))
     write_cameras(tmp_path / "cameras.shp", [row], None)
     with shapefile.Reader(str(tmp_path / "cameras.shp")) as reader:
         name = reader.record(0)["image"]

@@ -213,7 +213,8 @@ def camera_rows(
         )
     for index, rejection in sorted(rejections.items()):
         position = tagged.get(index, (None,))[0]
-        rows.append(rejected_row(shots[index], rejection.reason, gps=position, retries=retries.get(index, 0)))
+        tries = retries.get(index, 0)
+        rows.append(rejected_row(shots[index], index + 1, rejection.reason, gps=position, retries=tries))
     return rows
 
 

@@ -152,6 +152,7 @@ def test_check(qgis: Any, survey: Path, tmp_path: Path) -> None:
     assert rows["SIM_0001.JPG"]["above_ground_m"] == pytest.approx(80.0, abs=5.0)
     assert checked["CHECKED"].crs().authid() == checked["FOOTPRINTS"].crs().authid() == "EPSG:32633"
     assert checked["FOOTPRINTS"].featureCount() == 11
+    assert [field.name() for field in checked["FOOTPRINTS"].fields()] == ["image", "gsd_m", "area_m2", "overlap"]
     assert checked["FOOTPRINTS"].extent().contains(checked["CHECKED"].extent())
     assert 0.6 < checked["OVERLAP"] < 0.95 and 0.15 < checked["GSD"] < 0.21
     assert checked["TIME"] > 0.0 and checked["MEMORY"] > 100.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,13 @@ from .vector import esri_wkt, fit_text
 
 # Oblique views see to the horizon: a footprint ends where the ground is this many flying heights away.
 MAX_REACH = 4.0
-FIELDS = (("image", "C", 254, 0), ("gsd_m", "N", 12, 5), ("area_m2", "N", 16, 2), ("overlap", "N", 6, 0))
+FIELDS = (
+    ("image", "C", 254, 0),
+    ("number", "N", 9, 0),
+    ("gsd_m", "N", 12, 5),
+    ("area_m2", "N", 16, 2),
+    ("overlap", "N", 6, 0),
+)
 
 
 @dataclass(frozen=True)
@@ -24,6 +30,7 @@ class Footprint:
     """The ground that one photograph covers, in the export frame."""
 
     image: str
+    number: int  # shot index + 1, as in `rows.CameraRow`
     outline: Float  # (8, 2) corners and mid-edges, clockwise, m
     gsd_m: float  # ground sampling distance at the centre of the outline
     overlap: int = 1  # photographs that cover the centre of the outline, this one included
@@ -56,7 +63,7 @@ def footprint(camera: PlacedCamera, ground_z_m: float) -> Footprint | None:
     down = np.maximum(-rays[:, 2], level / MAX_REACH)
     outline = centre[:2] + rays[:, :2] * (height_m / down)[:, None]
     slant_m = float(np.linalg.norm([*(outline.mean(axis=0) - centre[:2]), height_m]))
-    return Footprint(camera.name, outline, slant_m / max(intrinsics.fx, intrinsics.fy))
+    return Footprint(camera.name, camera.index + 1, outline, slant_m / max(intrinsics.fx, intrinsics.fy))
 
 
 def with_overlap(footprints: Sequence[Footprint]) -> list[Footprint]:
@@ -67,7 +74,7 @@ def with_overlap(footprints: Sequence[Footprint]) -> list[Footprint]:
     counts = np.zeros(len(footprints), int)
     for item in footprints:
         counts += in_ring(centres, item.outline)
-    return [Footprint(f.image, f.outline, f.gsd_m, int(count)) for f, count in zip(footprints, counts, strict=True)]
+    return [replace(item, overlap=int(count)) for item, count in zip(footprints, counts, strict=True)]
 
 
 def write_footprints(path: Path, footprints: Iterable[Footprint], crs: str | None) -> int:
@@ -82,7 +89,8 @@ def write_footprints(path: Path, footprints: Iterable[Footprint], crs: str | Non
             for item in footprints:
                 ring = _clockwise(item.outline)
                 writer.poly([[*ring.tolist(), ring[0].tolist()]])
-                writer.record(fit_text(item.image, 254, keep_end=True), item.gsd_m, item.area_m2, item.overlap)
+                name = fit_text(item.image, 254, keep_end=True)
+                writer.record(name, item.number, item.gsd_m, item.area_m2, item.overlap)
                 count += 1
         temporary.with_suffix(".cpg").write_text("UTF-8", encoding="ascii")
         if crs is None:

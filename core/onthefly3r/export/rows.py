@@ -18,6 +18,7 @@ class CameraRow:
     """A photograph in the export frame; names as in the shapefile, lengths in m, angles in degrees."""
 
     image: str
+    number: int  # shot index + 1: point source id in the cloud, IMAGE_ID in the COLMAP model
     status: Literal["placed", "rejected"]
     reason: str = ""  # why it was rejected
     x: float | None = None  # position of a placed camera, export frame
@@ -104,6 +105,7 @@ def placed_row(
     gps_x, gps_y, gps_z = gps or (None, None, None)
     return CameraRow(
         image=shot.name,
+        number=camera.index + 1,
         status="placed",
         x=x,
         y=y,
@@ -129,12 +131,13 @@ def placed_row(
 
 
 def rejected_row(
-    shot: Shot, reason: str, *, gps: tuple[float, float, float | None] | None = None, retries: int = 0
+    shot: Shot, number: int, reason: str, *, gps: tuple[float, float, float | None] | None = None, retries: int = 0
 ) -> CameraRow:
-    """Return the row of a photograph that was not placed; `gps` as in `placed_row`."""
+    """Return the row of a photograph that was not placed; `number` is its shot index + 1, `gps` as in `placed_row`."""
     gps_x, gps_y, gps_z = gps or (None, None, None)
     return CameraRow(
         image=shot.name,
+        number=number,
         status="rejected",
         reason=reason,
         gps_x=gps_x,

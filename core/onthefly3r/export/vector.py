@@ -11,6 +11,7 @@ from .rows import CameraRow
 # name (ASCII, at most 10 characters), dBASE type, width, decimals
 FIELDS: tuple[tuple[str, str, int, int], ...] = (
     ("image", "C", 254, 0),
+    ("number", "N", 9, 0),
     ("status", "C", 10, 0),
     ("reason", "C", 254, 0),
     ("x", "N", 18, 4),
