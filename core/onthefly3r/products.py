@@ -195,10 +195,13 @@ def camera_rows(
     frame: ExportFrame,
     options: Options,
 ) -> list[CameraRow]:
-    """Return one row per photograph, placed ones first, with tagged positions in the export frame."""
+    """Return one row per photograph, placed ones first, both in capture order, whatever order the shots came in.
+
+    Tagged positions are in the export frame.
+    """
     tagged = _tagged_positions(shots, frame, options) if reference else {}
     rows = []
-    for camera in cameras:
+    for camera in sorted(cameras, key=lambda camera: shots[camera.index].capture_order):
         position, sigma_h_m, sigma_v_m = tagged.get(camera.index, (None, None, None))
         rows.append(
             placed_row(
@@ -211,10 +214,10 @@ def camera_rows(
                 convergence_deg=frame.convergence_deg(state.map_from_cam(camera.index)),
             )
         )
-    for index, rejection in sorted(rejections.items()):
+    for index in sorted(rejections, key=lambda index: shots[index].capture_order):
         position = tagged.get(index, (None,))[0]
-        tries = retries.get(index, 0)
-        rows.append(rejected_row(shots[index], index + 1, rejection.reason, gps=position, retries=tries))
+        reason, tries = rejections[index].reason, retries.get(index, 0)
+        rows.append(rejected_row(shots[index], index + 1, reason, gps=position, retries=tries))
     return rows
 
 

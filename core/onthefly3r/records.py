@@ -6,6 +6,7 @@ GpsFix, Attitude -> Shot -> WorkingImage -> Features -> Descriptor
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -58,6 +59,11 @@ class Shot:
     attitude: Attitude | None = None
     above_takeoff_m: float | None = None  # flying height that the drone states
     warnings: tuple[str, ...] = ()
+
+    @property
+    def capture_order(self) -> tuple[float, str]:
+        """What sorts shots by capture time then name; those without a time come last."""
+        return math.inf if self.time_s is None else self.time_s, self.name
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 import random
 from collections import defaultdict
@@ -42,7 +41,7 @@ def read_photographs(
             refused[name] = RefusedPhotograph(name, error.reason)
         except OSError as error:
             refused[name] = RefusedPhotograph(name, f"cannot be read ({error.strerror or type(error).__name__})")
-    shots.sort(key=lambda shot: (math.inf if shot.time_s is None else shot.time_s, shot.name))
+    shots.sort(key=lambda shot: shot.capture_order)
     shots = shots[: options.limit]
     if options.shuffle_seed is not None:
         random.Random(options.shuffle_seed).shuffle(shots)  # noqa: S311 (an order for tests, no secret)
