@@ -109,6 +109,21 @@ def test_picture_shows_cloud_and_cameras_where_they_are(tmp_path: Path, suffix: 
     assert [p.name for p in tmp_path.glob(".*")] == []
 
 
+@pytest.mark.parametrize(("beyond_m", "shown"), [(60.0, True), (120.0, False)])
+def test_rejected_photographs_around_the_map_are_in_the_picture(tmp_path: Path, beyond_m: float, shown: bool) -> None:
+    points = ground(np.random.default_rng(0))
+    cloud = write(tmp_path / "cloud.laz", points, np.full((len(points), 3), 90))
+    rows = [CameraRow("a", 1, "placed", x=ORIGIN[0] + 40, y=ORIGIN[1] + 20, z=200.0)]
+    rows.append(CameraRow("b", 2, "rejected", gps_x=ORIGIN[0] + 80 + beyond_m, gps_y=ORIGIN[1] + 20))
+    write_preview(tmp_path / "preview.png", cloud, rows, "", georeferenced=True)
+    with Image.open(tmp_path / "preview.png") as picture:
+        crosses = near(np.asarray(picture), REJECTED)
+        in_map = crosses[crosses[:, 0] < picture.size[1] - 84]  # the legend has one too
+    assert bool(len(in_map)) == shown
+    if shown:
+        assert picture.size[0] * 0.9 < in_map[:, 1].mean() < picture.size[0]
+
+
 def test_one_camera_and_a_tiny_cloud(tmp_path: Path) -> None:
     cloud = write(tmp_path / "c.laz", ORIGIN + np.zeros((1, 3)), np.full((1, 3), 90))
     rows = [CameraRow("a", 1, "placed", x=ORIGIN[0], y=ORIGIN[1], z=5.0)]

@@ -34,7 +34,7 @@ def write_preview(path: Path, cloud: CloudSummary, rows: Sequence[CameraRow], ti
     """Write a PNG about 1600 px wide of a cloud that was written.
 
     Placed cameras are dots joined in capture order, rejected ones crosses at their tagged position. Points far outside
-    the bulk of the cloud may lie outside the picture.
+    the bulk of the cloud and rejected ones farther than its size beyond it may lie outside the picture.
 
     Args:
         path: final name, ending in .png.
@@ -45,7 +45,7 @@ def write_preview(path: Path, cloud: CloudSummary, rows: Sequence[CameraRow], ti
     """
     from PIL import Image, ImageDraw
 
-    window = _window(cloud.window, [row for row in rows if row.status == "placed"])
+    window = _window(cloud.window, rows)
     scale_px_m = min(WIDTH_PX / window.width, MAX_HEIGHT_PX / window.height)
     # Pixels no finer than the points: an open cloud still gives a closed picture.
     pixel_m = max(1.0 / scale_px_m, cloud.mean_spacing_m if np.isfinite(cloud.mean_spacing_m) else 0.0)
@@ -76,9 +76,13 @@ def round_length(longest: float) -> float:
     return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= longest * (1.0 + 1e-9)))
 
 
-def _window(cloud: tuple[float, float, float, float], placed: Sequence[CameraRow]) -> Window:
-    positions = np.array([row.position[:2] for row in placed if row.position]).reshape(-1, 2)
-    everything = np.concatenate([np.reshape(cloud, (2, 2)), positions])
+def _window(cloud: tuple[float, float, float, float], rows: Sequence[CameraRow]) -> Window:
+    everything = np.concatenate([np.reshape(cloud, (2, 2)), _positions(rows, "placed")])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    # A tag may be wrong by kilometres: rejected ones count up to the window's larger side away.
+    rejected, reach = _positions(rows, "rejected"), float((high - low).max())
+    near = rejected[((rejected >= low - reach) & (rejected <= high + reach)).all(axis=1)]
+    everything = np.concatenate([everything, near])
     low, high = everything.min(axis=0), everything.max(axis=0)
     side = max(float((high - low).max()), 1e-6)
     middle, half = (low + high) / 2.0, np.maximum((high - low) / 2.0, side / 8.0)  # no slivers
@@ -86,9 +90,13 @@ def _window(cloud: tuple[float, float, float, float], placed: Sequence[CameraRow
     return Window(float(low[0]), float(low[1]), float(high[0]), float(high[1])).grown(MARGIN * side)
 
 
+def _positions(rows: Sequence[CameraRow], status: str) -> Float:
+    """Return the positions (N, 2) in the plane of the rows that have the status and a position."""
+    return np.array([row.position[:2] for row in rows if row.status == status and row.position]).reshape(-1, 2)
+
+
 def _draw_cameras(draw: ImageDraw, rows: Sequence[CameraRow], to_pixels: Callable[[Float], Float]) -> None:
-    placed = [to_pixels(np.array(row.position[:2])) for row in rows if row.status == "placed" and row.position]
-    rejected = [to_pixels(np.array(row.position[:2])) for row in rows if row.status == "rejected" and row.position]
+    placed, rejected = to_pixels(_positions(rows, "placed")), to_pixels(_positions(rows, "rejected"))
     if len(placed) > 1:
         path = [(float(x), float(y)) for x, y in placed]
         draw.line(path, fill=(*BACKGROUND, 120), width=5, joint="curve")
