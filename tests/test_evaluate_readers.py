@@ -85,7 +85,7 @@ def test_colmap_lines_of_points(tmp_path: Path, between: str) -> None:
 def test_our_table(tmp_path: Path) -> None:
     cameras = placed(["z.jpg", "a/b, c.jpg", "m.jpg"])
     rows = [placed_row(camera, shot(camera.name)) for camera in cameras]
-    rows.insert(1, rejected_row(shot("lost.jpg"), "no"))
+    rows.insert(1, rejected_row(shot("lost.jpg"), 4, "no"))
     write_trajectory(tmp_path / "trajectory.csv", rows)
     assert_poses(tmp_path, cameras, 1e-5, 1e-7)
 

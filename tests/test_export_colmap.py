@@ -43,12 +43,20 @@ def observed(placed: list[PlacedCamera]) -> SparsePoints:
     return SparsePoints(points, rgb, rng.uniform(0, 1, 20), point[order], image[order], pixels[order])
 
 
-def test_pycolmap_reads_cameras_poses_and_tracks(tmp_path: Path) -> None:
+def read(folder: Path, form: str) -> pycolmap.Reconstruction:
+    model = pycolmap.Reconstruction()
+    {"text": model.read_text, "binary": model.read_binary, "either": model.read}[form](str(folder))
+    return model
+
+
+@pytest.mark.parametrize("form", ["text", "binary"])
+def test_pycolmap_reads_cameras_poses_and_tracks(tmp_path: Path, form: str) -> None:
     placed = cameras()
     sparse = observed(placed)
     write_model(tmp_path, placed, sparse)
-    model = pycolmap.Reconstruction(str(tmp_path))
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["cameras.txt", "images.txt", "points3D.txt"]
+    model = read(tmp_path, form)
+    names = [f"{name}.{suffix}" for name in ("cameras", "images", "points3D") for suffix in ("bin", "txt")]
+    assert sorted(p.name for p in tmp_path.iterdir()) == names
     assert model.num_cameras() == 2
     for camera in placed:
         image = model.images[camera.index + 1]
@@ -73,14 +81,23 @@ def test_pycolmap_reads_cameras_poses_and_tracks(tmp_path: Path) -> None:
             assert image.project_point(point.xyz) == pytest.approx(seen.xy, abs=1e-4)
 
 
-def test_poses_alone(tmp_path: Path) -> None:
+@pytest.mark.parametrize("form", ["text", "binary"])
+def test_poses_alone(tmp_path: Path, form: str) -> None:
     write_model(tmp_path, cameras())
-    model = pycolmap.Reconstruction(str(tmp_path))
+    model = read(tmp_path, form)
     assert (model.num_reg_images(), model.num_points3D()) == (3, 0)
 
 
-def test_names_with_spaces_do_not_break_the_model(tmp_path: Path) -> None:
-    """COLMAP itself reads a name up to the first space; the file keeps the whole name."""
-    write_model(tmp_path, cameras(("flight 1/a.jpg", "flight 1/b.jpg", "flight 1/c.jpg")))
-    assert pycolmap.Reconstruction(str(tmp_path)).num_reg_images() == 3
-    assert "flight 1/b.jpg" in (tmp_path / "images.txt").read_text(encoding="utf-8")
+def test_colmap_reads_names_with_spaces_whole(tmp_path: Path) -> None:
+    placed = cameras(("flight 1/a.jpg", "flight 1/b 2.jpg", "Flüge  1/c.jpg"))
+    write_model(tmp_path, placed, observed(placed))
+    model = read(tmp_path, "either")
+    assert {i: image.name for i, image in model.images.items()} == {c.index + 1: c.name for c in placed}
+    assert all(f" {camera.name}\n" in (tmp_path / "images.txt").read_text(encoding="utf-8") for camera in placed)
+
+
+def test_an_undecodable_name_keeps_its_bytes(tmp_path: Path) -> None:
+    write_model(tmp_path, cameras(("a.jpg", "b \udcff.jpg", "c.jpg")))
+    assert b"b \xff.jpg\0" in (tmp_path / "images.bin").read_bytes()
+    assert b" b \xff.jpg\n" in (tmp_path / "images.txt").read_bytes()
+    assert read(tmp_path, "binary").num_reg_images() == 3

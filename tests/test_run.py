@@ -24,7 +24,7 @@ FAST = {"dense_px": 200, "threads": 2}
 FILES = (
     *("cloud.laz", "trajectory.csv", "preview.png", "report.json", "report.html"),
     *(f"{name}{suffix}" for name in ("cameras", "footprints") for suffix in (".shp", ".shx", ".dbf", ".prj", ".cpg")),
-    *(f"colmap/{name}.txt" for name in ("cameras", "images", "points3D")),
+    *(f"colmap/{name}{suffix}" for name in ("cameras", "images", "points3D") for suffix in (".txt", ".bin")),
 )
 
 

@@ -122,8 +122,8 @@ def test_survey_leaves_complete_files_and_reports_progress(small_survey: tuple[S
     survey, out, reports = small_survey
     names = sorted(path.name for path in (out / "photos").iterdir())
     assert names == [view.name for view in survey.views]
-    truth = {"cameras.txt", "images.txt", "points3D.txt", "cloud.las", "origin.json"}
-    assert {path.name for path in (out / "truth").iterdir()} == truth
+    model = {f"{name}{suffix}" for name in ("cameras", "images", "points3D") for suffix in (".txt", ".bin")}
+    assert {path.name for path in (out / "truth").iterdir()} == {*model, "cloud.las", "origin.json"}
     assert [report.done for report in reports] == list(range(7))
     assert {(report.stage, report.total) for report in reports} == {("simulate", 6)}
 

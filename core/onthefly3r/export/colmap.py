@@ -1,7 +1,8 @@
-"""The cameras and a few points as a COLMAP text model (cameras.txt, images.txt, points3D.txt)."""
+"""The cameras and a few points as a COLMAP model, as text for people and other programs and as binary for COLMAP."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,13 +29,16 @@ class SparsePoints:
 
 
 def write_model(folder: Path, cameras: Sequence[PlacedCamera], sparse: SparsePoints | None = None) -> None:
-    """Write a COLMAP text model in the export frame, with OPENCV cameras at the size of the photographs.
+    """Write a COLMAP model in the export frame, with OPENCV cameras at the size of the photographs.
+
+    The same model as cameras, images and points3D, each .txt and .bin: COLMAP reads a name in text only up to its first
+    space, and takes the binary files where both are. Undecodable names are written as the bytes of the file system.
 
     IMAGE_ID is the shot index + 1; images with equal intrinsics share a camera. Numbers keep all their digits, because
     projected coordinates are large. Observations in images that are not among `cameras` are left out, and so are points
-    that no camera sees. Names are written whole; COLMAP itself reads a name only up to its first space.
+    that no camera sees.
 
-    Format: https://colmap.github.io/format.html#text-format
+    Format: https://colmap.github.io/format.html
     """
     camera_ids: dict[Camera, int] = {}
     for placed in cameras:
@@ -43,6 +47,9 @@ def write_model(folder: Path, cameras: Sequence[PlacedCamera], sparse: SparsePoi
     _write_lines(folder / "cameras.txt", _camera_lines(camera_ids))
     _write_lines(folder / "images.txt", _image_lines(cameras, camera_ids, tracks))
     _write_lines(folder / "points3D.txt", _point_lines(sparse, tracks))
+    _write_bytes(folder / "cameras.bin", _camera_bytes(camera_ids))
+    _write_bytes(folder / "images.bin", _image_bytes(cameras, camera_ids, tracks))
+    _write_bytes(folder / "points3D.bin", _point_bytes(sparse, tracks))
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,12 @@ class _Tracks:
     image: Int  # (M,) shot index
     pixels: Float  # (M, 2)
     slot: Int  # (M,) POINT2D_IDX within the image
+
+    def by_point(self) -> Iterator[tuple[int, slice]]:
+        """Yield each point with the slice of its observations."""
+        points, first = np.unique(self.point, return_index=True)
+        for point, start, stop in zip(points, first, [*first[1:], len(self.point)], strict=True):
+            yield int(point), slice(int(start), int(stop))
 
 
 def _tracks(cameras: Sequence[PlacedCamera], sparse: SparsePoints | None) -> _Tracks | None:
@@ -81,9 +94,7 @@ def _image_lines(
     yield "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME (camera from world)"
     yield "# POINTS2D[] as (X, Y, POINT3D_ID)"
     for placed in cameras:
-        cam_from_world = placed.world_from_cam.inverse()
-        pose = (*_quaternion_wxyz(cam_from_world), *cam_from_world.translation)
-        yield f"{placed.index + 1} {_numbers(pose)} {camera_ids[placed.camera]} {placed.name}"
+        yield f"{placed.index + 1} {_numbers(_pose(placed))} {camera_ids[placed.camera]} {placed.name}"
         if tracks is None:
             yield ""
             continue
@@ -95,11 +106,50 @@ def _point_lines(sparse: SparsePoints | None, tracks: _Tracks | None) -> Iterato
     yield "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"
     if sparse is None or tracks is None:
         return
-    points, first = np.unique(tracks.point, return_index=True)
-    for point, start, stop in zip(points, first, [*first[1:], len(tracks.point)], strict=True):
-        track = " ".join(f"{tracks.image[k] + 1} {tracks.slot[k]}" for k in range(start, stop))
+    for point, seen in tracks.by_point():
+        track = " ".join(f"{i + 1} {slot}" for i, slot in zip(tracks.image[seen], tracks.slot[seen], strict=True))
         r, g, b = sparse.rgb[point]
         yield f"{point + 1} {_numbers(sparse.points[point])} {r} {g} {b} {float(sparse.error_px[point])!r} {track}"
+
+
+OPENCV_MODEL_ID = 4  # the binary files number the camera models
+
+
+def _camera_bytes(camera_ids: dict[Camera, int]) -> Iterator[bytes]:
+    yield struct.pack("<Q", len(camera_ids))
+    for camera, number in camera_ids.items():
+        parameters = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)
+        yield struct.pack("<IiQQ8d", number, OPENCV_MODEL_ID, camera.width, camera.height, *parameters)
+
+
+def _image_bytes(
+    cameras: Sequence[PlacedCamera], camera_ids: dict[Camera, int], tracks: _Tracks | None
+) -> Iterator[bytes]:
+    yield struct.pack("<Q", len(cameras))
+    for placed in cameras:
+        yield struct.pack("<I7dI", placed.index + 1, *_pose(placed), camera_ids[placed.camera])
+        yield placed.name.encode("utf-8", errors="surrogateescape") + b"\0"
+        seen = np.zeros(0, int) if tracks is None else np.flatnonzero(tracks.image == placed.index)
+        yield struct.pack("<Q", len(seen))
+        if tracks is not None:
+            yield from (struct.pack("<ddQ", *tracks.pixels[k], tracks.point[k] + 1) for k in seen)
+
+
+def _point_bytes(sparse: SparsePoints | None, tracks: _Tracks | None) -> Iterator[bytes]:
+    if sparse is None or tracks is None:
+        yield struct.pack("<Q", 0)
+        return
+    yield struct.pack("<Q", len(np.unique(tracks.point)))
+    for point, seen in tracks.by_point():
+        track = np.stack([tracks.image[seen] + 1, tracks.slot[seen]], axis=1).astype("<u4")
+        yield struct.pack("<Q3d3Bd", point + 1, *sparse.points[point], *sparse.rgb[point], sparse.error_px[point])
+        yield struct.pack("<Q", len(track)) + track.tobytes()
+
+
+def _pose(placed: PlacedCamera) -> tuple[float, ...]:
+    """Return QW, QX, QY, QZ, TX, TY, TZ of the camera from the world."""
+    cam_from_world = placed.world_from_cam.inverse()
+    return (*_quaternion_wxyz(cam_from_world), *(float(value) for value in cam_from_world.translation))
 
 
 def _quaternion_wxyz(cam_from_world: Rigid3) -> tuple[float, float, float, float]:
@@ -119,3 +169,8 @@ def _write_lines(path: Path, lines: Iterator[str]) -> None:
         temporary.open("w", encoding="utf-8", errors="surrogateescape", newline="\n") as stream,
     ):
         stream.writelines(line + "\n" for line in lines)
+
+
+def _write_bytes(path: Path, pieces: Iterator[bytes]) -> None:
+    with replacing(path) as temporary, temporary.open("wb") as stream:
+        stream.writelines(pieces)

@@ -1,4 +1,4 @@
-"""What a simulated survey really looks like: cameras as a COLMAP text model, the surface as a LAS cloud."""
+"""What a simulated survey really looks like: cameras as a COLMAP model, the surface as a LAS cloud."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MIN_VIEWS = 3  # the cloud is what so many photographs have in their frame
 
 
 def write_truth(survey: Survey, folder: Path) -> None:
-    """Write cameras.txt, images.txt, points3D.txt (local ENU, m), origin.json and cloud.las into a folder.
+    """Write a COLMAP model of the cameras (local ENU, m), origin.json and cloud.las into a folder.
 
     The cloud is in the UTM zone of the origin, with heights as in the photographs' tags. origin.json names the
     WGS 84 position of the ENU origin, that zone (`crs`) and the height reference of the cloud (`vertical`).
