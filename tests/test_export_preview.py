@@ -127,6 +127,6 @@ def test_rejected_photographs_around_the_map_are_in_the_picture(tmp_path: Path, 
 def test_one_camera_and_a_tiny_cloud(tmp_path: Path) -> None:
     cloud = write(tmp_path / "c.laz", ORIGIN + np.zeros((1, 3)), np.full((1, 3), 90))
     rows = [CameraRow("a", 1, "placed", x=ORIGIN[0], y=ORIGIN[1], z=5.0)]
-    write_preview(tmp_path / "preview.png", cloud, rows, "", georeferenced=False)
+    write_preview(tmp_path / "preview.png", cloud, rows, "", georeferenced=False, unit="map units")
     with Image.open(tmp_path / "preview.png") as picture:
         assert picture.size[0] >= 640

@@ -38,13 +38,16 @@ class ExportFrame:
 
     level_from_map: Sim3  # to east-north-up metres, or to the levelled map
     world: WorldFrame | None  # None: coordinates stay in the levelled map
+    metric: bool = True  # whether the unit is the metre
 
     @classmethod
-    def of(cls, reference: GeoReference | None, up: Float | None, scale: float = 1.0) -> ExportFrame:
+    def of(cls, reference: GeoReference | None, up: Float | None, metres_per_map_unit: float | None) -> ExportFrame:
         """Return the frame of a georeference; without one, the map turned so that `up` points up, and scaled."""
         if reference is not None:
             return cls(reference.enu_from_map, world_frame(reference))
-        return cls(Sim3(scale, _turning_up(up), np.zeros(3)), None)
+        return cls(
+            Sim3(metres_per_map_unit or 1.0, _turning_up(up), np.zeros(3)), None, metres_per_map_unit is not None
+        )
 
     @property
     def wkt(self) -> str | None:
@@ -112,7 +115,8 @@ def write_products(
     write_trajectory(out / "trajectory.csv", rows)
     write_model(out / "colmap", cameras, _sparse_points(state, frame))
     if cloud is not None:
-        write_preview(out / "preview.png", cloud, rows, title, georeferenced=reference is not None)
+        unit = "m" if frame.metric else "map units"
+        write_preview(out / "preview.png", cloud, rows, title, georeferenced=reference is not None, unit=unit)
     return cloud
 
 

@@ -182,7 +182,7 @@ def _finish(
     cloud: CloudSummary | None = None
     reference: GeoReference | None = None
     failure: ReconstructionError | None = None
-    scale = 1.0
+    metres_per_unit: float | None = None
     warnings = list(outcome.warnings)
     placed, rejected = len(state.frames), len(outcome.rejections) + len(outcome.refused)
 
@@ -205,9 +205,8 @@ def _finish(
             up = ground_normal(state)
             poses = {index: state.map_from_cam(index) for index in state.frames}
             if options.georeference.local:
-                known = metres_per_map_unit(poses, outcome.shots, options.georeference)
-                scale = known or scale
-                if known is None:
+                metres_per_unit = metres_per_map_unit(poses, outcome.shots, options.georeference)
+                if metres_per_unit is None:
                     warnings.append("no positions tell the scale: the units of the local frame are not metres")
             else:
                 reference = georeference(poses, outcome.shots, options.georeference, up)
@@ -221,7 +220,7 @@ def _finish(
                 outcome.rejections,
                 outcome.retries,
                 reference,
-                ExportFrame.of(reference, up, scale),
+                ExportFrame.of(reference, up, metres_per_unit),
                 options,
                 out.resolve().name,
                 checkpoint,

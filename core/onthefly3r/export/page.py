@@ -70,7 +70,7 @@ def _summary(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     if geo:
         rows.append(("Coordinates", f"{geo['crs']}, heights {GEOID.get(geo['vertical'], 'as in the tags')}"))
     elif cloud:
-        rows.append(("Coordinates", "map units without a coordinate reference system"))
+        rows.append(("Coordinates", "local, without a coordinate reference system"))
     if cloud:
         rows.append(("Points", f"{cloud['points']:,}"))
         rows.append(("Mean distance of points", f"{_number(cloud['mean_spacing_m'], 3)} m"))

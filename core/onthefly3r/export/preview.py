@@ -30,7 +30,9 @@ PLACED = (45, 212, 235)
 REJECTED = (255, 82, 82)
 
 
-def write_preview(path: Path, cloud: CloudSummary, rows: Sequence[CameraRow], title: str, georeferenced: bool) -> None:
+def write_preview(
+    path: Path, cloud: CloudSummary, rows: Sequence[CameraRow], title: str, georeferenced: bool, unit: str = "m"
+) -> None:
     """Write a PNG about 1600 px wide of a cloud that was written.
 
     Placed cameras are dots joined in capture order, rejected ones crosses at their tagged position. Points far outside
@@ -41,7 +43,8 @@ def write_preview(path: Path, cloud: CloudSummary, rows: Sequence[CameraRow], ti
         cloud: of `las.write_cloud`; its file is read in chunks.
         rows: in capture order, in the frame of the cloud.
         title: first line of the picture.
-        georeferenced: draws a north arrow and calls lengths metres.
+        georeferenced: draws a north arrow.
+        unit: of lengths.
     """
     from PIL import Image, ImageDraw
 
@@ -65,7 +68,7 @@ def write_preview(path: Path, cloud: CloudSummary, rows: Sequence[CameraRow], ti
     top_left = np.array([window.min_x, window.max_y])
     _draw_cameras(draw, rows, lambda xy: (np.asarray(xy) - top_left) * (scale_px_m, -scale_px_m) + corner)
     _draw_title(draw, picture.width, title, rows, georeferenced)
-    _draw_legend(draw, picture.size, rows, scale_px_m, "m" if georeferenced else "map units")
+    _draw_legend(draw, picture.size, rows, scale_px_m, unit)
     with replacing(path) as temporary:
         picture.save(temporary, format="PNG", compress_level=4)
 
