@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,6 +61,9 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     first.rename(photos / "weitere" / first.name)
     (photos / "broken.jpg").write_bytes(sorted(photos.glob("*.JPG"))[0].read_bytes()[:3000])
     (photos / "no picture.jpg").write_text("hello", encoding="utf-8")
+    if sys.platform == "linux":  # where names are bytes, one that is no text must not cost the whole run
+        third = sorted(photos.glob("*.JPG"))[2]
+        third.rename(third.with_name(os.fsdecode(b"bad \xff name.JPG")))
     told: list[Progress] = []
     result = reconstruct(photos, out, Options.from_flat(FAST), told.append)
     return Case(photos, folder / "truth", out, result, told)
@@ -87,7 +92,7 @@ def test_cameras_and_cloud_are_where_they_were(case: Case) -> None:
     """Cameras to half a per cent of the flying height of 80 m, the cloud as it lies near the surface."""
     report = evaluate(case.out, case.truth, case.truth / "cloud.las")
     assert report.poses is not None and report.surface is not None
-    assert report.poses.coverage == 1.0
+    assert report.poses.n_common == (11 if sys.platform == "linux" else 12)  # one has another name than in the truth
     assert report.poses.ate < 0.4
     assert report.surface.accuracy_median < 1.0
 

@@ -168,7 +168,7 @@ class PoseGraphOptions:
 
     pose_graph: Literal["sim3", "se3", "none"] = option(
         "sim3",
-        "sim3 moves submaps with their points, se3 is the paper's frame graph, none switches it off",
+        "sim3 moves submaps and frames with their points, se3 is the paper's frame graph, none switches it off",
         choices=("sim3", "se3", "none"),
         advanced=True,
     )
