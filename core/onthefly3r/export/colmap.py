@@ -140,10 +140,11 @@ def _point_bytes(sparse: SparsePoints | None, tracks: _Tracks | None) -> Iterato
         yield struct.pack("<Q", 0)
         return
     yield struct.pack("<Q", len(np.unique(tracks.point)))
+    xyz, error_px = sparse.points.astype("<f8"), sparse.error_px.astype("<f8")
+    elements = np.stack([tracks.image + 1, tracks.slot], axis=1).astype("<u4")
     for point, seen in tracks.by_point():
-        track = np.stack([tracks.image[seen] + 1, tracks.slot[seen]], axis=1).astype("<u4")
-        yield struct.pack("<Q3d3Bd", point + 1, *sparse.points[point], *sparse.rgb[point], sparse.error_px[point])
-        yield struct.pack("<Q", len(track)) + track.tobytes()
+        yield struct.pack("<Q", point + 1) + xyz[point].tobytes() + sparse.rgb[point].tobytes()
+        yield error_px[point].tobytes() + struct.pack("<Q", seen.stop - seen.start) + elements[seen].tobytes()
 
 
 def _pose(placed: PlacedCamera) -> tuple[float, ...]:
