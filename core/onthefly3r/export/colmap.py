@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,6 +60,7 @@ class _Tracks:
     image: Int  # (M,) shot index
     pixels: Float  # (M, 2)
     slot: Int  # (M,) POINT2D_IDX within the image
+    of_image: Mapping[int, Int]  # rows of each image that sees points, by slot
 
     def by_point(self) -> Iterator[tuple[int, slice]]:
         """Yield each point with the slice of its observations."""
@@ -74,11 +75,13 @@ def _tracks(cameras: Sequence[PlacedCamera], sparse: SparsePoints | None) -> _Tr
     order = np.lexsort((sparse.image, sparse.point))
     order = order[np.isin(sparse.image[order], [placed.index for placed in cameras])]
     point, image, pixels = sparse.point[order], sparse.image[order], sparse.pixels[order]
+    by_image = np.argsort(image, kind="stable")
+    indices, first = np.unique(image[by_image], return_index=True)
+    of_image = dict(zip(indices.tolist(), np.split(by_image, first[1:]), strict=True)) if len(indices) else {}
     slot = np.zeros(len(order), np.int64)
-    for index in np.unique(image):
-        seen = image == index
-        slot[seen] = np.arange(np.count_nonzero(seen))
-    return _Tracks(point, image, pixels, slot)
+    for seen in of_image.values():
+        slot[seen] = np.arange(len(seen))
+    return _Tracks(point, image, pixels, slot, of_image)
 
 
 def _camera_lines(camera_ids: dict[Camera, int]) -> Iterator[str]:
@@ -98,7 +101,7 @@ def _image_lines(
         if tracks is None:
             yield ""
             continue
-        seen = np.flatnonzero(tracks.image == placed.index)
+        seen = tracks.of_image.get(placed.index, ())
         yield " ".join(f"{_numbers(tracks.pixels[k])} {tracks.point[k] + 1}" for k in seen)
 
 
@@ -129,7 +132,7 @@ def _image_bytes(
     for placed in cameras:
         yield struct.pack("<I7dI", placed.index + 1, *_pose(placed), camera_ids[placed.camera])
         yield placed.name.encode("utf-8", errors="surrogateescape") + b"\0"
-        seen = np.zeros(0, int) if tracks is None else np.flatnonzero(tracks.image == placed.index)
+        seen = () if tracks is None else tracks.of_image.get(placed.index, ())
         yield struct.pack("<Q", len(seen))
         if tracks is not None:
             yield from (struct.pack("<ddQ", *tracks.pixels[k], tracks.point[k] + 1) for k in seen)
