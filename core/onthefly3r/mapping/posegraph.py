@@ -86,7 +86,8 @@ def optimise_submaps(state: MapState, solver: PoseGraphSolver, priors: Sequence[
     settled. Priors that contradict their neighbours are left out. The shift is in spacings.
     """
     sightings = shared_sightings(state)
-    if not sightings:
+    tree = len(sightings) <= _fitted(sightings)
+    if not sightings or (tree and not priors):  # nothing to balance
         return 0.0
     nodes = dict(state.map_from_submap)
     nodes |= {FRAMES + seen.frame: state.submap_pose_of(seen.frame) for seen in sightings}
@@ -119,8 +120,7 @@ def view_noise(nodes: Mapping[int, Sim3], sightings: Sequence[Sighting], least_p
     than they are good: the unknowns' share is added.
     """
     steps = np.array([_misfit_at_camera(nodes, seen) for seen in sightings])
-    fitted = len({seen.frame for seen in sightings}) + len({seen.submap for seen in sightings}) - 1
-    grow = np.sqrt(len(sightings) / max(len(sightings) - fitted, 1))
+    grow = np.sqrt(len(sightings) / max(len(sightings) - _fitted(sightings), 1))
     rotation, position = (np.sqrt(np.median((steps[:, k : k + 3] ** 2).mean(axis=1)) / MEDIAN_OF_THREE) for k in (0, 3))
     log_scale = np.sqrt(np.median(steps[:, 6] ** 2) / MEDIAN_OF_ONE)
     return ViewNoise(
@@ -128,6 +128,11 @@ def view_noise(nodes: Mapping[int, Sim3], sightings: Sequence[Sighting], least_p
         position=max(float(grow * position), least_position),
         log_scale=max(float(grow * log_scale), LEAST_NOISE),
     )
+
+
+def _fitted(sightings: Sequence[Sighting]) -> int:
+    """Return how many sightings it takes to fix all frames and submaps that they join to one another."""
+    return len({seen.frame for seen in sightings}) + len({seen.submap for seen in sightings}) - 1
 
 
 def _misfit_at_camera(nodes: Mapping[int, Sim3], seen: Sighting) -> Float:
