@@ -15,9 +15,18 @@ def new_frame(
     """Return pose, compact reference and coloured confident points of one image, in the frame of its submap."""
     kept = trusted_pixels(view, min_confidence)
     rgb = colours_at_grid(view, image)
+    reference = compact_reference(view, reference_points, min_confidence)
+    depths = view.local_from_cam.inverse().apply(reference.points)[:, 2]
     return NewFrame(
-        frame=Frame(index, submap, view.camera, view.grid_from_photo, view.local_from_cam),
-        reference=compact_reference(view, reference_points, min_confidence),
+        frame=Frame(
+            index,
+            submap,
+            view.camera,
+            view.grid_from_photo,
+            view.local_from_cam,
+            float(np.median(depths)) if len(depths) else 0.0,
+        ),
+        reference=reference,
         points=view.points[kept].astype(np.float32),
         rgb=rgb[kept],
         confidence=np.rint(255.0 * view.confidence[kept]).astype(np.uint8),

@@ -56,6 +56,7 @@ def submap_to_json(submap: Submap) -> dict[str, Any]:
                 "camera": asdict(frame.camera),
                 "grid_from_photo": asdict(frame.grid_from_photo),
                 "submap_from_cam": rigid3_to_json(frame.submap_from_cam),
+                "depth": frame.depth,
             }
             for frame in submap.frames
         ],
@@ -85,6 +86,7 @@ def submap_from_json(value: Any) -> Submap:
             camera_from_json(f["camera"]),
             PixelMap(**{name: float(v) for name, v in f["grid_from_photo"].items()}),
             rigid3_from_json(f["submap_from_cam"]),
+            float(f["depth"]),
         )
         for f in value["frames"]
     )
