@@ -57,7 +57,7 @@ def map_of(work: Path, enu: np.ndarray, per_submap: int = 5) -> MapState:
         frames = []
         for index in range(start, min(start + per_submap, len(enu))):
             in_map = MAP_FROM_ENU.apply_to_pose(Rigid3(NADIR, enu[index]))
-            frames.append(Frame(index, number, CAMERA, PixelMap(1.0, 1.0), pose.inverse().apply_to_pose(in_map)))
+            frames.append(Frame(index, number, CAMERA, PixelMap(1.0, 1.0), pose.inverse().apply_to_pose(in_map), 1.0))
         state.commit(Submap(number, pose, tuple(frames), ()), [])
     return state
 
@@ -101,7 +101,7 @@ def test_priors_take_the_bend_out_of_a_map(tmp_path: Path) -> None:
     shots = shots_at(enu, RTK_M, RTK_M)
     tie = tie_of(state, shots)
     before = distances_m(state, tie, enu)
-    state.move_submaps({p.submap: p.map_from_submap for p in pose_priors(state, tie, shots)}, {})
+    state.move_submaps({p.submap: p.map_from_submap for p in pose_priors(state, tie, shots)}, {}, {})
     after = distances_m(state, tie, enu)
     assert before.max() > 1.5 and after.max() < 0.35  # what is bent within a submap stays
 
@@ -134,7 +134,7 @@ def test_a_wrong_position_within_a_submap_counts_little(tmp_path: Path) -> None:
     wrong[32, 0] += 40.0
     state, shots = map_of(tmp_path, enu), shots_at(wrong, RTK_M, RTK_M)
     tie = tie_of(state, shots)
-    state.move_submaps({p.submap: p.map_from_submap for p in pose_priors(state, tie, shots)}, {})
+    state.move_submaps({p.submap: p.map_from_submap for p in pose_priors(state, tie, shots)}, {}, {})
     assert np.delete(distances_m(state, tie, enu), 32).max() < 1.0
 
 

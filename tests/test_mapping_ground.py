@@ -25,7 +25,7 @@ def state_over(work: Path, height_of: object, frames: int = 12, points: int = 20
         x, y = centre[:2, None] + 40.0 * rng.uniform(-1.0, 1.0, (2, points))
         ground = np.column_stack([x, y, height_of(x, y, rng)])  # type: ignore[operator]
         reference = CompactReference(np.zeros((points, 2), np.int32), ground.astype(np.float32), np.ones(points))
-        frame = Frame(k, k, CAMERA, PixelMap(1.0, 1.0), Rigid3(np.diag([1.0, -1.0, -1.0]), centre))
+        frame = Frame(k, k, CAMERA, PixelMap(1.0, 1.0), Rigid3(np.diag([1.0, -1.0, -1.0]), centre), 1.0)
         empty = np.zeros((0, 3), np.float32)
         new = NewFrame(frame, reference, empty, empty.astype(np.uint8), np.zeros(0, np.uint8))
         state.commit(Submap(k, MAP_FROM_ENU, (frame,), ()), [new])

@@ -13,15 +13,17 @@ from onthefly3r.errors import MissingDependencyError
 from onthefly3r.geometry.camera import Camera, PixelMap
 from onthefly3r.geometry.transforms import Rigid3, Sim3, rotation_angle_deg, rotation_exp
 from onthefly3r.mapping.posegraph import (
-    FRAMES,
     MEDIAN_MISFIT,
     PosePrior,
-    ViewNoise,
     consistent_priors,
     default_solver,
     floored,
     optimise_frames,
     optimise_submaps,
+)
+from onthefly3r.mapping.sightings import (
+    FRAMES,
+    ViewNoise,
     shared_sightings,
     submap_edges,
     tangent,
@@ -84,7 +86,7 @@ def state_of(work: Path, poses: dict[int, Sim3], edges: list[Edge]) -> MapState:
     """A map whose submaps hold one frame each, at their origins."""
     state = MapState(Store(work))
     for k, pose in poses.items():
-        frame = Frame(100 + k, k, CAMERA, PixelMap(1.0, 1.0), Rigid3())
+        frame = Frame(100 + k, k, CAMERA, PixelMap(1.0, 1.0), Rigid3(), 1.0)
         state.commit(Submap(k, pose, (frame,), tuple(sighting(e) for e in edges if e.target == k)), [])
     state.spacing = 0.1
     return state
@@ -172,8 +174,10 @@ def test_cameras_follow_their_submaps_and_a_tree_stays_as_it_is(tmp_path: Path) 
     assert shift == pytest.approx(np.abs(moved).max() / 0.1)
     assert errors(state.map_from_submap, truth).max() < errors(drifted, truth).max()
     unseen = state.frames[111]  # by any other submap
-    np.testing.assert_array_equal(
-        state.map_from_cam(111).translation, state.map_from_submap[11].apply(unseen.submap_from_cam.translation)
+    np.testing.assert_allclose(  # but for what little bend these few sightings show
+        state.map_from_cam(111).translation,
+        state.map_from_submap[11].apply(unseen.submap_from_cam.translation),
+        atol=1e-3,
     )
 
 
@@ -205,7 +209,7 @@ def block(work: Path, seed: int, n_submaps: int = 12, n_frames: int = 60, seen: 
     state = MapState(Store(work))
     own = {i: (i % n_submaps, *view(i % n_submaps, i)) for i in range(n_frames)}
     for k, pose in truth.items():
-        frames = tuple(Frame(i, k, CAMERA, PixelMap(1.0, 1.0), cam) for i, (s, _, cam) in own.items() if s == k)
+        frames = tuple(Frame(i, k, CAMERA, PixelMap(1.0, 1.0), cam, 1.0) for i, (s, _, cam) in own.items() if s == k)
         others = [i for i in own if own[i][0] < k]
         again = [int(i) for i in rng.permutation(others)[:seen]]
         sightings = []
@@ -291,7 +295,8 @@ def test_priors_unbend_a_chain_and_wrong_ones_are_dropped(tmp_path: Path) -> Non
     before = errors(state.map_from_submap, truth).max()
     optimise_submaps(state, default_solver(), priors)
     after = errors(state.map_from_submap, truth)
-    assert before > 2.0 and after.max() < 0.25
+    assert before > 2.0 and after[1:].max() < 0.15
+    assert after[0] < 0.4  # no prior of its own: as far off as two bent edges lead it
     assert [p.submap for p in consistent_priors(priors, chain)] == [1, 2, 3, 4, 6, 7, 8, 9, 10, 11]
     assert consistent_priors(priors[:1], []) == priors[:1]  # no one to ask
 
@@ -310,7 +315,7 @@ def test_a_prior_may_leave_directions_open() -> None:
 
 def test_submaps_that_saw_the_same_frame_are_tied(tmp_path: Path) -> None:
     state, _ = block(tmp_path, 9)
-    edges = submap_edges(state, NOISE)
+    edges = submap_edges(shared_sightings(state), state, NOISE)
     assert len(edges) == len(state.sightings)
     misfits = []
     for edge in edges:

@@ -35,7 +35,7 @@ def state(tmp_path: Path) -> MapState:
         frames = []
         for index in members:
             view = moved(true_view(index, 0.1, np.random.default_rng(index)), MAP_FROM_SUBMAP[number].inverse())
-            frame = Frame(index, number, view.camera, view.grid_from_photo, view.local_from_cam)
+            frame = Frame(index, number, view.camera, view.grid_from_photo, view.local_from_cam, 1.0)
             empty = np.zeros((0, 3), np.float32)
             reference = compact_reference(view, 400, 0.5)
             frames.append(NewFrame(frame, reference, empty, empty.astype(np.uint8), np.zeros(0, np.uint8)))
@@ -76,7 +76,7 @@ def test_a_reference_that_was_moved_is_seen_in_the_frame_of_its_points(state: Ma
     """Where a frame is in the map does not change how its stored points lie in the new submap."""
     model = local_model(SUBSET.members)
     before = registered(state, model).sightings
-    state.move_submaps({}, {6: Sim3(1.0, np.eye(3), np.array([0.3, 0.0, 0.0])) @ state.submap_pose_of(6)})
+    state.move_submaps({}, {6: Sim3(1.0, np.eye(3), np.array([0.3, 0.0, 0.0])) @ state.submap_pose_of(6)}, {})
     after = registered(state, model).sightings
     for one, other in zip(before, after, strict=True):
         np.testing.assert_allclose(other.frame_from_submap.matrix(), one.frame_from_submap.matrix(), atol=1e-6)

@@ -69,7 +69,7 @@ def filled(work: Path) -> MapState:
     submap, frames = batch(1, [7, 1], (sighting(4, 1),))
     seen = FrameEdge(4, 7, rigid(3), 0.01, 0.2, "ref")
     state.commit(replace(submap, frame_edges=(seen,), calibrations={"maker model": replace(LENS, fx=1.0)}), frames)
-    state.move_submaps({1: pose(77)}, {2: pose(78)})
+    state.move_submaps({1: pose(77)}, {2: pose(78)}, {})
     return state
 
 
@@ -111,7 +111,7 @@ def test_a_journal_gives_the_same_map_again(tmp_path: Path) -> None:
 def test_cameras_references_and_cloud_move_with_their_submap(tmp_path: Path) -> None:
     state = filled(tmp_path)
     before, unmoved = state.map_from_cam(7), state.map_from_cam(4)
-    state.move_submaps({1: pose(5) @ pose(77)}, {})
+    state.move_submaps({1: pose(5) @ pose(77)}, {}, {})
     np.testing.assert_allclose(state.map_from_cam(7).matrix(), pose(5).apply_to_pose(before).matrix(), atol=1e-12)
     assert state.submap_pose_of(7) is state.map_from_submap[1]
     np.testing.assert_array_equal(state.map_from_cam(4).matrix(), unmoved.matrix())

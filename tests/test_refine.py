@@ -57,7 +57,7 @@ def drifted_map(work: Path, truth: synthetic.Block, with_observations: bool = Tr
             off = Rigid3(
                 pose.rotation @ rotation_exp(0.003 * rng.standard_normal(3)), pose.translation + rng.normal(0.0, 0.1, 3)
             )
-            frame = Frame(index, number, camera, PixelMap(), local_from_map.apply_to_pose(off))
+            frame = Frame(index, number, camera, PixelMap(), local_from_map.apply_to_pose(off), 1.0)
             points = local_from_map.apply(truth.points[truth.seen[index]]).astype(np.float32)
             reference = CompactReference(
                 np.zeros((0, 2), np.int32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32)

@@ -24,8 +24,9 @@ from ..records import Sighting
 from .sightings import ViewNoise, misfits_at_camera, motion_at_camera
 from .state import MapState
 
-LEVEL = 0.1  # of the scene's depth: how far cameras are off a plane square to the direction in which they look
+LEVEL = 0.05  # of the scene's depth: how far cameras are off a plane square to the direction in which they look
 OUTLYING = 3.0  # times the noise: views that miss by more were placed wrong, and count the less
+ROUNDING = 1e-9  # of what a bend does to the views: less of it left than that is none
 WIDE = 10.0  # times what one submap leaves open: the spread of curvatures to begin with
 STEPS = 30  # of estimating that spread
 
@@ -89,16 +90,19 @@ class Doming:
         """Return what straightens the surroundings of a camera at a place (3,) in a submap."""
         return self.dish_of[submap].straighten(centre, self.curvature_of[submap])
 
-    def straighten(self, seen: Sighting) -> Sighting:
-        """Return a sighting as the submap would have it if it were not bent."""
-        straight_from_bent = self.straight_from_bent(seen.submap, seen.submap_from_cam.translation)
-        return replace(seen, frame_from_submap=seen.frame_from_submap @ straight_from_bent.inverse())
+    def straightened(self, sightings: Sequence[Sighting]) -> list[Sighting]:
+        """Return sightings as the submaps would have them if they were not bent."""
+        straight = []
+        for seen in sightings:
+            straight_from_bent = self.straight_from_bent(seen.submap, seen.submap_from_cam.translation)
+            straight.append(replace(seen, frame_from_submap=seen.frame_from_submap @ straight_from_bent.inverse()))
+        return straight
 
 
-def flat(state: MapState) -> Doming:
-    """Return the doming of a map whose submaps are not bent."""
+def found_so_far(state: MapState) -> Doming:
+    """Return how bent the submaps of a map were found; those that are new are taken to be flat."""
     dish_of = dishes(state)
-    return Doming(dish_of, dict.fromkeys(dish_of, 0.0))
+    return Doming(dish_of, dict.fromkeys(dish_of, 0.0) | state.curvature_of)
 
 
 def estimate(
@@ -142,8 +146,11 @@ def _told(misfits: Float, seen: Sequence[Sighting], dish: Dish, scale: float, no
     missed, bends, moves = np.split(whitened.reshape(-1, 9), [1, 2], axis=1)
     # What moving the submap as a whole explains says nothing of its bend.
     basis = np.linalg.qr(moves)[0]
-    bends = bends - basis @ (basis.T @ bends)
-    return float((bends * bends).sum()), float((bends * missed).sum())
+    shape = bends - basis @ (basis.T @ bends)
+    information = float((shape * shape).sum())
+    if information < ROUNDING * float((bends * bends).sum()):
+        return 0.0, 0.0
+    return information, float((shape * missed).sum())
 
 
 def _most_likely(information: Float, toward: Float) -> Float:
@@ -153,7 +160,7 @@ def _most_likely(information: Float, toward: Float) -> Float:
     """
     if not information.any():
         return np.zeros(len(information))
-    variance = WIDE / np.median(information[information > 0.0])
+    variance = WIDE / float(np.median(information[information > 0.0]))
     found = np.zeros(len(information))
     for _ in range(STEPS):
         left = 1.0 / (information + 1.0 / variance)

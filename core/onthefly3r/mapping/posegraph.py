@@ -19,7 +19,7 @@ from ..errors import MissingDependencyError
 from ..geometry.arrays import Float
 from ..geometry.transforms import Rigid3, Sim3
 from ..records import Edge, FrameEdge, Sighting
-from .doming import estimate, flat
+from .doming import estimate, found_so_far
 from .sightings import (
     FRAMES,
     LEAST_NOISE,
@@ -92,18 +92,18 @@ def optimise_submaps(state: MapState, solver: PoseGraphSolver, priors: Sequence[
     nodes = dict(state.map_from_submap)
     nodes |= {FRAMES + seen.frame: state.submap_pose_of(seen.frame) for seen in sightings}
     before = {index: state.map_from_cam(index).translation for index in state.frames}
-    doming = flat(state)
-    nodes, noise = _balance(nodes, sightings, state, solver, priors)
+    doming = found_so_far(state)
+    nodes, noise = _balance(nodes, doming.straightened(sightings), state, solver, priors)
     for _ in range(ROUNDS):
         doming = estimate(nodes, sightings, doming.dish_of, noise)
-        straight = [doming.straighten(seen) for seen in sightings]
-        nodes, noise = _balance(nodes, straight, state, solver, priors)
+        nodes, noise = _balance(nodes, doming.straightened(sightings), state, solver, priors)
     of_frames = {
         index: nodes[frame.submap] @ doming.straight_from_bent(frame.submap, frame.submap_from_cam.translation)
         for index, frame in state.frames.items()
     }
     of_frames |= {node - FRAMES: pose for node, pose in nodes.items() if node >= FRAMES}
-    state.move_submaps({node: pose for node, pose in nodes.items() if node < FRAMES}, of_frames)
+    map_from_submap = {node: pose for node, pose in nodes.items() if node < FRAMES}
+    state.move_submaps(map_from_submap, of_frames, doming.curvature_of)
     shift = max(float(np.abs(state.map_from_cam(i).translation - before[i]).max()) for i in before)
     return shift / state.spacing
 

@@ -29,6 +29,7 @@ class MapState:
         self.frame_edges: list[FrameEdge] = []
         self.calibrations: dict[str, Camera] = {}
         self.spacing = float("nan")  # l_scene, map units
+        self.curvature_of: dict[int, float] = {}  # of submaps found bent, per unit of the submap
         self._moved: dict[int, Rigid3] = {}
         self._settled: dict[int, Sim3] = {}
 
@@ -45,6 +46,7 @@ class MapState:
                 elif kind == "settled":
                     state.map_from_submap.update({int(k): sim3_from_json(v) for k, v in value["submaps"].items()})
                     state._settled.update({int(k): sim3_from_json(v) for k, v in value["frames"].items()})
+                    state.curvature_of.update({int(k): float(v) for k, v in value["curvatures"].items()})
                 elif kind == "refined":
                     state._settled.update({int(k): sim3_from_json(v) for k, v in value["frames"].items()})
                     state.calibrations.update({k: camera_from_json(v) for k, v in value["calibrations"].items()})
@@ -94,15 +96,19 @@ class MapState:
         for key, camera in submap.calibrations.items():
             self.calibrations.setdefault(key, camera)
 
-    def move_submaps(self, map_from_submap: Mapping[int, Sim3], of_frames: Mapping[int, Sim3]) -> None:
+    def move_submaps(
+        self, map_from_submap: Mapping[int, Sim3], of_frames: Mapping[int, Sim3], curvature_of: Mapping[int, float]
+    ) -> None:
         """Take over optimised submap poses; cameras, references and cloud follow.
 
         Frames in `of_frames` go where that says instead, each with its references and its part of the cloud.
         """
         self.map_from_submap.update(map_from_submap)
         self._settled.update(of_frames)
+        self.curvature_of.update(curvature_of)
         submaps, frames = ({str(k): sim3_to_json(v) for k, v in m.items()} for m in (map_from_submap, of_frames))
-        self._store.note("settled", {"submaps": submaps, "frames": frames})
+        curvatures = {str(k): v for k, v in curvature_of.items()}
+        self._store.note("settled", {"submaps": submaps, "frames": frames, "curvatures": curvatures})
 
     def move_refined(self, map_from_submap: Mapping[int, Sim3], calibrations: Mapping[str, Camera]) -> None:
         """Take over refined frames, each with its references and its part of the cloud, and intrinsics."""
