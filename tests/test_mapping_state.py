@@ -28,7 +28,7 @@ from onthefly3r.mapping.journal import (
 from onthefly3r.mapping.state import MapState
 from onthefly3r.mapping.store import Store
 from onthefly3r.records import Attitude, FrameEdge, GpsFix, NewFrame, Shot, Sighting, Submap, WorkingImage
-from synthetic_models import true_references, true_view
+from synthetic_models import HEIGHT_M, true_references, true_view
 
 LENS = Camera(4000, 3000, 2801.5, 2799.25, 2010.0, 1490.0, (-0.08, 0.02, 4e-4, -3e-4))
 
@@ -80,10 +80,11 @@ def assert_same(one: MapState, other: MapState) -> None:
     assert one.frame_edges[0].kind == other.frame_edges[0].kind
     for index, frame in one.frames.items():
         again = other.frames[index]
-        assert (frame.submap, frame.camera, frame.grid_from_photo) == (
+        assert (frame.submap, frame.camera, frame.grid_from_photo, frame.depth) == (
             again.submap,
             again.camera,
             again.grid_from_photo,
+            again.depth,
         )
         np.testing.assert_array_equal(one.map_from_cam(index).matrix(), other.map_from_cam(index).matrix())
         for name in ("pixels", "points", "confidence"):
@@ -251,3 +252,10 @@ def test_a_new_frame_keeps_confident_points_with_the_colour_of_their_pixel() -> 
     np.testing.assert_array_equal(new.rgb[-1], picture.rgb[-1, -1])
     np.testing.assert_array_equal(colours_at_grid(view, picture), picture.rgb)
     assert (new.reference.pixels[:, 0] >= 30).all()
+    assert new.frame.depth == pytest.approx(HEIGHT_M, rel=0.1)  # over rolling ground
+
+
+def test_a_frame_without_confident_points_has_no_depth() -> None:
+    view = true_view(3)
+    new = new_frame(3, 8, replace(view, confidence=np.zeros_like(view.confidence)), image(3), 0.5, 300)
+    assert new.frame.depth == 0.0 and len(new.points) == 0

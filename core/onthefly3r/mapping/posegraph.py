@@ -19,7 +19,7 @@ from ..errors import MissingDependencyError
 from ..geometry.arrays import Float
 from ..geometry.transforms import Rigid3, Sim3
 from ..records import Edge, FrameEdge, Sighting
-from .doming import estimate, found_so_far
+from .bending import estimate, found_so_far
 from .sightings import (
     FRAMES,
     LEAST_NOISE,
@@ -37,7 +37,7 @@ HUBER = 1.345  # whitened units
 MAX_ITERATIONS = 30
 MEDIAN_MISFIT = 6.35  # of a chi-squared variable of seven degrees of freedom
 OUTLYING_PRIOR = 10.0  # times the usual squared misfit
-ROUNDS = 5  # of looking for bends in what does not agree yet, and of solving the graph without them
+ROUNDS = 3  # of looking for bends in what does not agree yet, and of solving the graph without them
 
 
 @dataclass(frozen=True)
@@ -92,18 +92,18 @@ def optimise_submaps(state: MapState, solver: PoseGraphSolver, priors: Sequence[
     nodes = dict(state.map_from_submap)
     nodes |= {FRAMES + seen.frame: state.submap_pose_of(seen.frame) for seen in sightings}
     before = {index: state.map_from_cam(index).translation for index in state.frames}
-    doming = found_so_far(state)
-    nodes, noise = _balance(nodes, doming.straightened(sightings), state, solver, priors)
+    bending = found_so_far(state)
+    nodes, noise = _balance(nodes, bending.straightened(sightings), state, solver, priors)
     for _ in range(ROUNDS):
-        doming = estimate(nodes, sightings, doming.dish_of, noise)
-        nodes, noise = _balance(nodes, doming.straightened(sightings), state, solver, priors)
+        bending = estimate(nodes, sightings, bending.sheet_of, noise)
+        nodes, noise = _balance(nodes, bending.straightened(sightings), state, solver, priors)
     of_frames = {
-        index: nodes[frame.submap] @ doming.straight_from_bent(frame.submap, frame.submap_from_cam.translation)
+        index: nodes[frame.submap] @ bending.straight_from_bent(frame.submap, frame.submap_from_cam.translation)
         for index, frame in state.frames.items()
     }
     of_frames |= {node - FRAMES: pose for node, pose in nodes.items() if node >= FRAMES}
     map_from_submap = {node: pose for node, pose in nodes.items() if node < FRAMES}
-    state.move_submaps(map_from_submap, of_frames, doming.curvature_of)
+    state.move_submaps(map_from_submap, of_frames, bending.curvatures_of)
     shift = max(float(np.abs(state.map_from_cam(i).translation - before[i]).max()) for i in before)
     return shift / state.spacing
 

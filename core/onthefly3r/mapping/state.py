@@ -6,7 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import islice
 
+import numpy as np
+
 from ..errors import InputError
+from ..geometry.arrays import Float
 from ..geometry.camera import Camera
 from ..geometry.transforms import Rigid3, Sim3
 from ..records import CompactReference, Frame, FrameEdge, NewFrame, Observations, Sighting, Submap
@@ -29,7 +32,7 @@ class MapState:
         self.frame_edges: list[FrameEdge] = []
         self.calibrations: dict[str, Camera] = {}
         self.spacing = float("nan")  # l_scene, map units
-        self.curvature_of: dict[int, float] = {}  # of submaps found bent, per unit of the submap
+        self.curvatures_of: dict[int, Float] = {}  # of submaps found bent (`bending.py`)
         self._moved: dict[int, Rigid3] = {}
         self._settled: dict[int, Sim3] = {}
 
@@ -46,7 +49,7 @@ class MapState:
                 elif kind == "settled":
                     state.map_from_submap.update({int(k): sim3_from_json(v) for k, v in value["submaps"].items()})
                     state._settled.update({int(k): sim3_from_json(v) for k, v in value["frames"].items()})
-                    state.curvature_of.update({int(k): float(v) for k, v in value["curvatures"].items()})
+                    state.curvatures_of.update({int(k): np.array(v, float) for k, v in value["curvatures"].items()})
                 elif kind == "refined":
                     state._settled.update({int(k): sim3_from_json(v) for k, v in value["frames"].items()})
                     state.calibrations.update({k: camera_from_json(v) for k, v in value["calibrations"].items()})
@@ -97,7 +100,7 @@ class MapState:
             self.calibrations.setdefault(key, camera)
 
     def move_submaps(
-        self, map_from_submap: Mapping[int, Sim3], of_frames: Mapping[int, Sim3], curvature_of: Mapping[int, float]
+        self, map_from_submap: Mapping[int, Sim3], of_frames: Mapping[int, Sim3], curvatures_of: Mapping[int, Float]
     ) -> None:
         """Take over optimised submap poses; cameras, references and cloud follow.
 
@@ -105,9 +108,9 @@ class MapState:
         """
         self.map_from_submap.update(map_from_submap)
         self._settled.update(of_frames)
-        self.curvature_of.update(curvature_of)
+        self.curvatures_of.update(curvatures_of)
         submaps, frames = ({str(k): sim3_to_json(v) for k, v in m.items()} for m in (map_from_submap, of_frames))
-        curvatures = {str(k): v for k, v in curvature_of.items()}
+        curvatures = {str(k): v.tolist() for k, v in curvatures_of.items()}
         self._store.note("settled", {"submaps": submaps, "frames": frames, "curvatures": curvatures})
 
     def move_refined(self, map_from_submap: Mapping[int, Sim3], calibrations: Mapping[str, Camera]) -> None:
