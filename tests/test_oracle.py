@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 from onthefly3r.geometry.transforms import Rigid3, Sim3, nearest_rotation, rotation_angle_deg
 from onthefly3r.geometry.umeyama import weighted_similarity
@@ -171,7 +174,7 @@ def test_bad_queries_spare_the_seed_unless_asked(survey: Survey) -> None:
 def test_doming_bends_cameras_and_points_alike(survey: Survey) -> None:
     bent = ask(OracleBackbone(survey, SILENT, Faults(doming_m=3.0)), Subset((), (0, 4, 8, 12, 15, 19, 23, 27)))
     middle = np.mean([true_pose(survey, i).translation for i in bent.views], axis=0)
-    bowl = oracle.Bowl(middle, 3.0, survey.options.altitude_m)
+    bowl = oracle.Bend(middle, 3.0 * oracle.BEND_FORMS["bowl"], survey.options.altitude_m)
     truth = {i: true_pose(survey, i) for i in bent.views}
     lifted = np.stack([bowl.apply(pose.translation) for pose in truth.values()])
     local = np.stack([view.local_from_cam.translation for view in bent.views.values()])
@@ -186,6 +189,23 @@ def test_doming_bends_cameras_and_points_alike(survey: Survey) -> None:
         # Calibrated rays cannot bend: towards the image corners the surface is met up to 1.6 m beside.
         error = np.abs(points - bowl.apply(true_points))
         assert error[..., 2].max() < 0.25 and error.max() < 2.0
+
+
+@pytest.mark.parametrize("form", ["bowl", "saddle", "cylinder"])
+def test_a_model_is_bent_in_the_form_asked_for(survey: Survey, form: oracle.BendForm) -> None:
+    """However much was drawn: a bend of that form explains all, one of another form does not."""
+    bent = ask(OracleBackbone(survey, replace(SILENT, bend_m=3.0, bend_form=form)), Subset((), tuple(range(0, 28, 3))))
+    truth = np.stack([true_pose(survey, i).translation for i in bent.views])
+    local = np.stack([view.local_from_cam.translation for view in bent.views.values()])
+
+    def misfit(sag_m: float, of_form: oracle.BendForm) -> float:
+        bend = oracle.Bend(truth.mean(axis=0), sag_m * oracle.BEND_FORMS[of_form], survey.options.altitude_m)
+        lifted = bend.apply(truth)
+        return float(np.abs(similarity(local, lifted).apply(local) - lifted).max())
+
+    least = {f: minimize_scalar(misfit, (0.0, 1.0), args=(f,)).fun for f in oracle.BEND_FORMS}
+    assert least[form] < 1e-5
+    assert all(value > 0.01 for f, value in least.items() if f != form)
 
 
 def test_tokens_turn_away_for_bad_views(survey: Survey) -> None:

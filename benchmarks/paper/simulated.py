@@ -49,6 +49,8 @@ SCENARIOS = {
         Scenario("joint", 58, 5, 1, False, NOISE, replace(FAULTS, bad_view_rate=0.0)),
         Scenario("HAV-in-order", 424, 14, 1, False, NOISE, FAULTS),
         Scenario("HAV", 424, 14, 2, False, NOISE, FAULTS),
+        Scenario("HAV-saddle", 424, 14, 2, False, replace(NOISE, bend_form="saddle"), FAULTS),
+        Scenario("HAV-cylinder", 424, 14, 2, False, replace(NOISE, bend_form="cylinder"), FAULTS),
         Scenario("Residence", 2582, 33, 2, True, NOISE, FAULTS),
         Scenario("Residence-plain", 2582, 33, 2, False, NOISE, FAULTS),
         Scenario("Campus", 5871, 50, 3, True, NOISE, FAULTS),

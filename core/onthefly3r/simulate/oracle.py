@@ -10,6 +10,7 @@ from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -26,6 +27,12 @@ STATED_ALTITUDE_M = 100.0
 CACHED_DEPTH_MAPS = 600  # about 150 KB each
 TOKEN_LENGTH = 64
 CAMERA_KEY = "simulated"
+BendForm = Literal["bowl", "saddle", "cylinder"]
+BEND_FORMS: dict[BendForm, Float] = {
+    "bowl": np.diag([1.0, 1.0]),
+    "saddle": np.diag([1.0, -1.0]),
+    "cylinder": np.diag([1.0, 0.0]),
+}
 COVISIBLE_WIDTHS = 0.6  # views whose footprints are less than so many widths apart see enough of the same ground
 
 
@@ -38,6 +45,7 @@ class Noise:
     depth: float = 0.002  # relative, once per pixel and once per image
     log_scale: float = 0.10
     bend_m: float = 0.0  # sag at one flying height from the middle, up or down; grows with the square of the extent
+    bend_form: BendForm = "bowl"
 
 
 @dataclass(frozen=True)
@@ -90,8 +98,9 @@ class OracleBackbone:
         bad = self._draw_bad_views(subset, rng)
         moves = self._draw_strays(subset, rng) if self._faults.strays else {}
         centres = np.stack([self._survey.views[i].enu_from_cam.translation for i in subset.members])
-        sag_m = self._faults.doming_m + (self._noise.bend_m * rng.standard_normal() if self._noise.bend_m else 0.0)
-        bend = Bowl(centres.mean(axis=0), sag_m * self._unit_m, self._survey.options.altitude_m)
+        drawn_m = self._noise.bend_m * rng.standard_normal() if self._noise.bend_m else 0.0
+        sags_m = self._faults.doming_m * BEND_FORMS["bowl"] + drawn_m * BEND_FORMS[self._noise.bend_form]
+        bend = Bend(centres.mean(axis=0), sags_m * self._unit_m, self._survey.options.altitude_m)
         scale = np.exp(self._noise.log_scale * rng.standard_normal()) / self._survey.options.altitude_m
         local_from_enu = Sim3(float(scale), rotation_exp(_random_rotation(rng)), rng.normal(0.0, 3.0, 3))
         context = _unit(rng.standard_normal(TOKEN_LENGTH))
@@ -157,13 +166,13 @@ class OracleBackbone:
         return self._grid.width / self._grid.fx * self._survey.options.altitude_m
 
     def _view(
-        self, index: int, is_bad: bool, bend: Bowl, local_from_enu: Sim3, context: Float, rng: np.random.Generator
+        self, index: int, is_bad: bool, bend: Bend, local_from_enu: Sim3, context: Float, rng: np.random.Generator
     ) -> LocalView:
         view, grid = self._survey.views[index], self._grid
         rays = grid.rays(grid.pixel_centres())
         bent_from_cam = bend.apply_to_pose(view.enu_from_cam)
         depth = self.true_depth(index).astype(float)
-        if bend.sag_m:
+        if bend.sags_m.any():
             bent_points = bend.apply(view.enu_from_cam.apply(depth[..., None] * rays))
             depth = bent_from_cam.inverse().apply(bent_points)[..., 2]
         pixel_error = rng.standard_normal(depth.shape)
@@ -195,17 +204,17 @@ class OracleBackbone:
 
 
 @dataclass(frozen=True, eq=False)
-class Bowl:
-    """A bend of space: the ground rises by sag_m * (r / radius_m)^2 at distance r, plumb lines stay normal to it."""
+class Bend:
+    """A bend of space: the ground rises by r' S r / radius^2 at an offset r, plumb lines stay normal to it."""
 
     middle: Float  # (3,) ENU m; its height does not matter
-    sag_m: float
+    sags_m: Float  # (2, 2) S, about east and north; a bowl has the same sag in all directions
     radius_m: float
 
     def apply(self, points: Float) -> Float:
         """Bend points (..., 3) in ENU."""
         offset = (points - self.middle)[..., :2]
-        rise = self.sag_m / self.radius_m**2 * np.sum(offset**2, axis=-1, keepdims=True)
+        rise = 0.5 * np.sum(offset * self._slope(points), axis=-1, keepdims=True)
         return np.asarray(points + np.concatenate([-points[..., 2:] * self._slope(points), rise], axis=-1))
 
     def apply_to_pose(self, enu_from_cam: Rigid3) -> Rigid3:
@@ -215,7 +224,7 @@ class Bowl:
         return Rigid3(turn @ enu_from_cam.rotation, self.apply(enu_from_cam.translation))
 
     def _slope(self, points: Float) -> Float:
-        return np.asarray(2.0 * self.sag_m / self.radius_m**2 * (points - self.middle)[..., :2])
+        return np.asarray(2.0 / self.radius_m**2 * (points - self.middle)[..., :2] @ self.sags_m)
 
 
 class OracleDescriber:
