@@ -118,7 +118,7 @@ def _balance(
     """Return the nodes as they agree best, and the noise of views that was expected of them: that which they showed."""
     noise = view_noise(nodes, sightings, LEAST_NOISE * state.spacing)
     edges = [view_edge(seen, state.map_from_submap[seen.submap].scale, noise) for seen in sightings]
-    known = consistent_priors(priors, submap_edges(sightings, state, noise))
+    known = consistent_priors(priors, submap_edges(sightings, state, noise)) if priors else []
     return solver.solve_sim3(nodes, edges, known, fixed=0), noise
 
 
