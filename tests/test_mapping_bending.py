@@ -10,7 +10,7 @@ import pytest
 from onthefly3r.geometry.camera import Camera, PixelMap
 from onthefly3r.geometry.transforms import Rigid3, Sim3, nearest_rotation, rotation_angle_deg, rotation_exp
 from onthefly3r.mapping import posegraph
-from onthefly3r.mapping.bending import FORMS, Bending, estimate, found_so_far, sheet, sheets
+from onthefly3r.mapping.bending import FORMS, Bending, estimate, found_so_far, sheet
 from onthefly3r.mapping.posegraph import default_solver, optimise_submaps
 from onthefly3r.mapping.sightings import FRAMES, ViewNoise, shared_sightings
 from onthefly3r.mapping.state import MapState
@@ -210,5 +210,5 @@ def test_what_was_found_stays_with_the_map(tmp_path: Path) -> None:
 def test_one_frame_in_common_tells_nothing_of_a_bend(tmp_path: Path) -> None:
     state, _ = survey(tmp_path, 3, drawn(3))
     nodes = state.map_from_submap | {FRAMES + s.frame: state.submap_pose_of(s.frame) for s in state.sightings}
-    found: Bending = estimate(nodes, shared_sightings(state)[:1], sheets(state), NOISE)
+    found: Bending = estimate(nodes, shared_sightings(state)[:1], found_so_far(state), NOISE)
     np.testing.assert_array_equal(list(found.curvatures_of.values()), np.zeros((MODELS, 3)))

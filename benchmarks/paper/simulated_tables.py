@@ -31,7 +31,9 @@ def strategies_table(rows: Sequence[dict[str, Any]], out: Path, scenario: str) -
     """
     lines = []
     for strategy in STRATEGIES:
-        runs = [r for r in rows if r["scenario"] == scenario and r["strategy"] == strategy]
+        runs = sorted(
+            (r for r in rows if r["scenario"] == scenario and r["strategy"] == strategy), key=lambda r: r["seed"]
+        )
         if not runs or strategy.startswith("case-"):
             continue
         poses = [_poses(out, scenario, strategy, r["seed"]) for r in runs]
@@ -59,7 +61,7 @@ def ablation_table(rows: Sequence[dict[str, Any]], scenario: str) -> str:
     """Return tab:ablation on a simulated survey; in brackets the paper's value for HAV or Residence."""
     lines = []
     for name, case in CASES.items():
-        runs = [r for r in rows if r["scenario"] == scenario and r["strategy"] == name]
+        runs = sorted((r for r in rows if r["scenario"] == scenario and r["strategy"] == name), key=lambda r: r["seed"])
         if not runs:
             continue
         told = {"HAV": case.hav, "Residence": case.residence}.get(scenario, (None,) * 4)

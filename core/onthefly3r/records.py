@@ -212,7 +212,7 @@ class Frame:
     camera: Camera
     grid_from_photo: PixelMap
     submap_from_cam: Rigid3
-    depth: float  # of its points along the optical axis, median; units of the submap
+    depth: float  # of its points along the optical axis, median; units of the submap; 0 where none is known
 
 
 @dataclass(frozen=True)

@@ -40,14 +40,14 @@ class Sheet:
 
     middle: Float  # (3,) of the cameras
     axes: Float  # (3, 3) rows: along, across, and up: away from the scene, square to the plane of the cameras
-    height: float  # of the cameras above the scene
+    height: float  # of the middle above the scene
 
     def bends(self, centre: Float) -> Float:
         """Return [turn in rad, shift] (6, 3) of a camera at a place (3,), for a curvature of one of each form."""
-        flat = (self.axes @ (centre - self.middle))[:2]
+        *flat, rise = self.axes @ (centre - self.middle)
         slopes = FORMS @ flat  # (3, 2)
         turns = np.column_stack([slopes[:, 1], -slopes[:, 0], np.zeros(3)])
-        shifts = np.column_stack([-self.height * slopes, 0.5 * slopes @ flat])
+        shifts = np.column_stack([-(self.height + rise) * slopes, 0.5 * slopes @ flat])
         return np.vstack([self.axes.T @ turns.T, self.axes.T @ shifts.T])
 
     def straighten(self, centre: Float, curvatures: Float) -> Sim3:
@@ -63,20 +63,20 @@ def sheets(state: MapState) -> dict[int, Sheet]:
     depths: dict[int, list[float]] = {}
     for frame in state.frames.values():
         poses.setdefault(frame.submap, []).append(frame.submap_from_cam)
-        depths.setdefault(frame.submap, []).append(frame.depth)
+        depths.setdefault(frame.submap, []).extend([frame.depth] if frame.depth else [])
     for seen in state.sightings:
         poses.setdefault(seen.submap, []).append(seen.submap_from_cam)
-    return {submap: sheet(poses[submap], float(np.median(depths[submap]))) for submap in depths}
+    return {submap: sheet(poses[submap], float(np.median(known)) if known else 0.0) for submap, known in depths.items()}
 
 
 def sheet(poses: Sequence[Rigid3], depth: float) -> Sheet:
     """Return the sheet of cameras that see the scene at a depth along their axes.
 
-    Cameras along a line leave its roll open, one camera everything: there `up` is against the direction of view.
+    Cameras along a line leave its roll open, one camera everything: there `up` is against the direction of view. Where
+    cameras look all round, there is no height, and what is left of a bend is its turns and its rise.
     """
     centres = np.array([pose.translation for pose in poses])
     view = np.mean([pose.rotation[:, 2] for pose in poses], axis=0)
-    view /= max(float(np.linalg.norm(view)), 1e-12)
     offsets = centres - centres.mean(axis=0)
     spread = offsets.T @ offsets + len(poses) * (LEVEL * depth) ** 2 * (np.eye(3) - np.outer(view, view))
     up = np.linalg.eigh(spread)[1][:, 0]
@@ -113,9 +113,7 @@ def found_so_far(state: MapState) -> Bending:
     return Bending(sheet_of, {submap: state.curvatures_of.get(submap, np.zeros(3)) for submap in sheet_of})
 
 
-def estimate(
-    nodes: Mapping[int, Sim3], sightings: Sequence[Sighting], sheet_of: Mapping[int, Sheet], noise: ViewNoise
-) -> Bending:
+def estimate(nodes: Mapping[int, Sim3], sightings: Sequence[Sighting], so_far: Bending, noise: ViewNoise) -> Bending:
     """Return the most likely curvatures of each submap, given where the frames are.
 
     Curvatures are drawn around zero; how widely is estimated with them (empirical Bayes), so that none is made up where
@@ -124,43 +122,50 @@ def estimate(
     Args:
         nodes: submaps and frames in the map, numbered as in the pose graph.
         sightings: as the submaps have them, bent.
-        sheet_of: what each submap bends about.
+        so_far: what each submap bends about, and the bends by which wrong views are told from bent ones.
         noise: of views.
     """
     misfits = misfits_at_camera(nodes, sightings)
+    left = misfits_at_camera(nodes, so_far.straightened(sightings))
+    weights = np.sqrt(np.minimum(1.0, OUTLYING / np.maximum(_length(left / noise.sigmas), 1e-12)))
     rows_of: dict[int, list[int]] = {}
     for row, seen in enumerate(sightings):
         rows_of.setdefault(seen.submap, []).append(row)
     told = [
-        _told(misfits[rows], [sightings[row] for row in rows], sheet_of[submap], nodes[submap].scale, noise)
+        _told(
+            misfits[rows] / noise.sigmas * weights[rows, None],
+            weights[rows, None] / noise.sigmas,
+            [sightings[row].submap_from_cam.translation for row in rows],
+            so_far.sheet_of[submap],
+            nodes[submap].scale,
+        )
         for submap, rows in rows_of.items()
     ]
     found = _most_likely(np.array([information for information, _ in told]), np.array([toward for _, toward in told]))
-    in_map = dict.fromkeys(sheet_of, np.zeros(3)) | dict(zip(rows_of, found, strict=True))
-    return Bending(sheet_of, {submap: nodes[submap].scale * curvatures for submap, curvatures in in_map.items()})
+    in_map = dict.fromkeys(so_far.sheet_of, np.zeros(3)) | dict(zip(rows_of, found, strict=True))
+    return Bending(so_far.sheet_of, {submap: nodes[submap].scale * curvatures for submap, curvatures in in_map.items()})
 
 
-def _told(
-    misfits: Float, seen: Sequence[Sighting], sheet: Sheet, scale: float, noise: ViewNoise
-) -> tuple[Float, Float]:
-    """Return what the misfits (N, 7) of a submap tell of its curvatures per map unit.
+def _length(whitened: Float) -> Float:
+    """Return the root mean square (N,) of rows (N, 7)."""
+    return np.asarray(np.sqrt((whitened**2).mean(axis=1)))
+
+
+def _told(missed: Float, whitening: Float, centres: Sequence[Float], sheet: Sheet, scale: float) -> tuple[Float, Float]:
+    """Return what the whitened misfits (N, 7) of a submap's cameras tell of its curvatures per map unit.
 
     Information (3, 3), and information times curvatures (3,).
     """
     in_map = np.array([1.0] * 3 + [scale] * 3 + [1.0])[:, None]
-    centres = [one.submap_from_cam.translation for one in seen]
     # 1 per map unit is `scale` per unit of the submap.
     bent = np.array([scale * in_map * np.vstack([sheet.bends(centre), np.zeros(3)]) for centre in centres])
     moved = np.array([in_map * motion_at_camera(centre) for centre in centres])
-    whitened = np.dstack([misfits[:, :, None], bent, moved]) / noise.sigmas[:, None]
-    length = np.sqrt((whitened[:, :, 0] ** 2).mean(axis=1))
-    whitened *= np.sqrt(np.minimum(1.0, OUTLYING / np.maximum(length, 1e-12)))[:, None, None]
-    missed, bends, moves = np.split(whitened.reshape(-1, 11), [1, 4], axis=1)
+    bends, moves = ((part * whitening[:, :, None]).reshape(-1, part.shape[2]) for part in (bent, moved))
     # What moving the submap as a whole explains says nothing of its bend.
     basis = np.linalg.qr(moves)[0]
     shape = bends - basis @ (basis.T @ bends)
     shape[:, (shape**2).sum(axis=0) < ROUNDING * (bends**2).sum(axis=0)] = 0.0
-    return shape.T @ shape, shape.T @ missed[:, 0]
+    return shape.T @ shape, shape.T @ missed.ravel()
 
 
 def _most_likely(information: Float, toward: Float) -> Float:

@@ -183,4 +183,4 @@ def _prior(submap: int, pose: Sim3, points: Float, targets: Float, root: Float) 
         if np.abs(step).max() < SETTLED:
             break
     information = from_origin.T @ ((vectors * values) @ vectors.T) @ from_origin
-    return PosePrior(submap, pose, np.asarray(information))
+    return PosePrior(submap, pose, np.asarray(information), middle)

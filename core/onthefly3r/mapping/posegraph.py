@@ -10,7 +10,7 @@ The solver sits behind `PoseGraphSolver`, because gtsam has no wheels for Window
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -19,11 +19,10 @@ from ..errors import MissingDependencyError
 from ..geometry.arrays import Float
 from ..geometry.transforms import Rigid3, Sim3
 from ..records import Edge, FrameEdge, Sighting
-from .bending import estimate, found_so_far
+from .bending import Bending, estimate, found_so_far
 from .sightings import (
     FRAMES,
     LEAST_NOISE,
-    ViewNoise,
     fitted,
     shared_sightings,
     submap_edges,
@@ -47,6 +46,7 @@ class PosePrior:
     submap: int
     map_from_submap: Sim3
     information: Float  # (7, 7) of [rotation rad, translation, log scale], right perturbation; may be singular
+    middle: Float = field(default_factory=lambda: np.zeros(3))  # (3,) of the cameras that it is known from, submap
 
 
 class PoseGraphSolver(Protocol):
@@ -93,10 +93,11 @@ def optimise_submaps(state: MapState, solver: PoseGraphSolver, priors: Sequence[
     nodes |= {FRAMES + seen.frame: state.submap_pose_of(seen.frame) for seen in sightings}
     before = {index: state.map_from_cam(index).translation for index in state.frames}
     bending = found_so_far(state)
-    nodes, noise = _balance(nodes, bending.straightened(sightings), state, solver, priors)
+    nodes = _balance(nodes, sightings, bending, state, solver, priors)
     for _ in range(ROUNDS):
-        bending = estimate(nodes, sightings, bending.sheet_of, noise)
-        nodes, noise = _balance(nodes, bending.straightened(sightings), state, solver, priors)
+        noise = view_noise(nodes, bending.straightened(sightings), LEAST_NOISE * state.spacing)
+        bending = estimate(nodes, sightings, bending, noise)
+        nodes = _balance(nodes, sightings, bending, state, solver, priors)
     of_frames = {
         index: nodes[frame.submap] @ bending.straight_from_bent(frame.submap, frame.submap_from_cam.translation)
         for index, frame in state.frames.items()
@@ -111,15 +112,24 @@ def optimise_submaps(state: MapState, solver: PoseGraphSolver, priors: Sequence[
 def _balance(
     nodes: Mapping[int, Sim3],
     sightings: Sequence[Sighting],
+    bending: Bending,
     state: MapState,
     solver: PoseGraphSolver,
     priors: Sequence[PosePrior],
-) -> tuple[dict[int, Sim3], ViewNoise]:
-    """Return the nodes as they agree best, and the noise of views that was expected of them: that which they showed."""
-    noise = view_noise(nodes, sightings, LEAST_NOISE * state.spacing)
-    edges = [view_edge(seen, state.map_from_submap[seen.submap].scale, noise) for seen in sightings]
-    known = consistent_priors(priors, submap_edges(sightings, state, noise)) if priors else []
-    return solver.solve_sim3(nodes, edges, known, fixed=0), noise
+) -> dict[int, Sim3]:
+    """Return the nodes as they agree best once the submaps are straightened."""
+    straight = bending.straightened(sightings)
+    noise = view_noise(nodes, straight, LEAST_NOISE * state.spacing)
+    edges = [view_edge(seen, state.map_from_submap[seen.submap].scale, noise) for seen in straight]
+    known = [_straightened(prior, bending) for prior in priors]
+    agreeing = consistent_priors(known, submap_edges(straight, state, noise)) if known else []
+    return solver.solve_sim3(nodes, edges, agreeing, fixed=0)
+
+
+def _straightened(prior: PosePrior, bending: Bending) -> PosePrior:
+    """Return a prior as the cameras that it is known from would give it if the submap were not bent."""
+    bent_from_straight = bending.straight_from_bent(prior.submap, prior.middle).inverse()
+    return replace(prior, map_from_submap=prior.map_from_submap @ bent_from_straight)
 
 
 def consistent_priors(priors: Sequence[PosePrior], edges: Sequence[Edge]) -> list[PosePrior]:

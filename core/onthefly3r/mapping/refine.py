@@ -1,6 +1,6 @@
 """Refinement: one bundle adjustment of all placed cameras over the features that the local models tied together.
 
-A pose graph balances whole submaps; it cannot bend one. Where the backbone tells which features of which images it
+A pose graph knows cameras only, one by one. Where the backbone tells which features of which images it
 saw as one point, those tracks join across submaps and fix every camera and the shared intrinsics at once.
 """
 

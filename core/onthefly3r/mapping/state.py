@@ -20,8 +20,8 @@ from .store import Store
 class MapState:
     """What is known of the scene; the only object that a committed batch changes.
 
-    Frames and points live in the frame of the submap that predicted them, so moving a submap (pose graph) moves
-    its cameras, its references and its cloud together.
+    Frames and points live in the frame of the submap that predicted them, and move with it: a camera, its references
+    and its part of the cloud together. The pose graph and the refinement then settle each frame on its own.
     """
 
     def __init__(self, store: Store) -> None:
@@ -32,7 +32,7 @@ class MapState:
         self.frame_edges: list[FrameEdge] = []
         self.calibrations: dict[str, Camera] = {}
         self.spacing = float("nan")  # l_scene, map units
-        self.curvatures_of: dict[int, Float] = {}  # of submaps found bent (`bending.py`)
+        self.curvatures_of: dict[int, Float] = {}  # (3,) as last found, per unit of the submap (`bending.py`)
         self._moved: dict[int, Rigid3] = {}
         self._settled: dict[int, Sim3] = {}
 
