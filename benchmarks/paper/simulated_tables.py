@@ -57,11 +57,16 @@ def strategies_table(rows: Sequence[dict[str, Any]], out: Path, scenario: str) -
     return markdown([*head, "Calls", "Inferred / image", "Largest call", "Passes: worst ratio"], lines)
 
 
+def _runs(rows: Sequence[dict[str, Any]], scenario: str, strategy: str) -> list[dict[str, Any]]:
+    """Return the rows of a strategy on a survey by seed."""
+    return sorted((r for r in rows if r["scenario"] == scenario and r["strategy"] == strategy), key=lambda r: r["seed"])
+
+
 def ablation_table(rows: Sequence[dict[str, Any]], scenario: str) -> str:
     """Return tab:ablation on a simulated survey; in brackets the paper's value for HAV or Residence."""
     lines = []
     for name, case in CASES.items():
-        runs = sorted((r for r in rows if r["scenario"] == scenario and r["strategy"] == name), key=lambda r: r["seed"])
+        runs = _runs(rows, scenario, name)
         if not runs:
             continue
         told = {"HAV": case.hav, "Residence": case.residence}.get(scenario, (None,) * 4)
