@@ -24,6 +24,7 @@ from onthefly3r.mapping.posegraph import (
 from onthefly3r.mapping.sightings import (
     FRAMES,
     ViewNoise,
+    misfits_at_camera,
     shared_sightings,
     submap_edges,
     tangent,
@@ -256,7 +257,7 @@ def test_the_noise_of_views_is_what_the_misfits_show(tmp_path: Path, unit: float
     for _ in range(2):
         edges = [view_edge(seen, scales[seen.submap], noise) for seen in sightings]
         solved = default_solver().solve_sim3(nodes, edges, [], fixed=0)
-        noise = view_noise(solved, sightings, 1e-9)
+        noise = view_noise(misfits_at_camera(solved, sightings), sightings, 1e-9)
     assert noise.rotation_rad == pytest.approx(NOISE.rotation_rad, rel=0.2)
     assert noise.position == pytest.approx(unit * NOISE.position, rel=0.2)
     assert noise.log_scale == pytest.approx(NOISE.log_scale, rel=0.2)

@@ -22,7 +22,7 @@ import numpy as np
 from ..geometry.arrays import Float
 from ..geometry.transforms import Rigid3, Sim3, rotation_exp
 from ..records import Sighting
-from .sightings import ViewNoise, misfits_at_camera, motion_at_camera
+from .sightings import misfits_at_camera, motion_at_camera, view_noise
 from .state import MapState
 
 FORMS = np.array([[[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])  # bowl, saddle, twist
@@ -113,7 +113,9 @@ def found_so_far(state: MapState) -> Bending:
     return Bending(sheet_of, {submap: state.curvatures_of.get(submap, np.zeros(3)) for submap in sheet_of})
 
 
-def estimate(nodes: Mapping[int, Sim3], sightings: Sequence[Sighting], so_far: Bending, noise: ViewNoise) -> Bending:
+def estimate(
+    nodes: Mapping[int, Sim3], sightings: Sequence[Sighting], so_far: Bending, least_position: float
+) -> Bending:
     """Return the most likely curvatures of each submap, given where the frames are.
 
     Curvatures are drawn around zero; how widely is estimated with them (empirical Bayes), so that none is made up where
@@ -123,18 +125,20 @@ def estimate(nodes: Mapping[int, Sim3], sightings: Sequence[Sighting], so_far: B
         nodes: submaps and frames in the map, numbered as in the pose graph.
         sightings: as the submaps have them, bent.
         so_far: what each submap bends about, and the bends by which wrong views are told from bent ones.
-        noise: of views.
+        least_position: least noise of a camera's position that is believed, map units.
     """
     misfits = misfits_at_camera(nodes, sightings)
     left = misfits_at_camera(nodes, so_far.straightened(sightings))
-    weights = np.sqrt(np.minimum(1.0, OUTLYING / np.maximum(_length(left / noise.sigmas), 1e-12)))
+    sigmas = view_noise(left, sightings, least_position).sigmas
+    length = np.sqrt(((left / sigmas) ** 2).mean(axis=1))
+    weights = np.sqrt(np.minimum(1.0, OUTLYING / np.maximum(length, 1e-12)))
     rows_of: dict[int, list[int]] = {}
     for row, seen in enumerate(sightings):
         rows_of.setdefault(seen.submap, []).append(row)
     told = [
         _told(
-            misfits[rows] / noise.sigmas * weights[rows, None],
-            weights[rows, None] / noise.sigmas,
+            misfits[rows] / sigmas * weights[rows, None],
+            weights[rows, None] / sigmas,
             [sightings[row].submap_from_cam.translation for row in rows],
             so_far.sheet_of[submap],
             nodes[submap].scale,
@@ -144,11 +148,6 @@ def estimate(nodes: Mapping[int, Sim3], sightings: Sequence[Sighting], so_far: B
     found = _most_likely(np.array([information for information, _ in told]), np.array([toward for _, toward in told]))
     in_map = dict.fromkeys(so_far.sheet_of, np.zeros(3)) | dict(zip(rows_of, found, strict=True))
     return Bending(so_far.sheet_of, {submap: nodes[submap].scale * curvatures for submap, curvatures in in_map.items()})
-
-
-def _length(whitened: Float) -> Float:
-    """Return the root mean square (N,) of rows (N, 7)."""
-    return np.asarray(np.sqrt((whitened**2).mean(axis=1)))
 
 
 def _told(missed: Float, whitening: Float, centres: Sequence[Float], sheet: Sheet, scale: float) -> tuple[Float, Float]:

@@ -24,6 +24,7 @@ from .sightings import (
     FRAMES,
     LEAST_NOISE,
     fitted,
+    misfits_at_camera,
     shared_sightings,
     submap_edges,
     tangent,
@@ -95,8 +96,7 @@ def optimise_submaps(state: MapState, solver: PoseGraphSolver, priors: Sequence[
     bending = found_so_far(state)
     nodes = _balance(nodes, sightings, bending, state, solver, priors)
     for _ in range(ROUNDS):
-        noise = view_noise(nodes, bending.straightened(sightings), LEAST_NOISE * state.spacing)
-        bending = estimate(nodes, sightings, bending, noise)
+        bending = estimate(nodes, sightings, bending, LEAST_NOISE * state.spacing)
         nodes = _balance(nodes, sightings, bending, state, solver, priors)
     of_frames = {
         index: nodes[frame.submap] @ bending.straight_from_bent(frame.submap, frame.submap_from_cam.translation)
@@ -119,7 +119,7 @@ def _balance(
 ) -> dict[int, Sim3]:
     """Return the nodes as they agree best once the submaps are straightened."""
     straight = bending.straightened(sightings)
-    noise = view_noise(nodes, straight, LEAST_NOISE * state.spacing)
+    noise = view_noise(misfits_at_camera(nodes, straight), straight, LEAST_NOISE * state.spacing)
     edges = [view_edge(seen, state.map_from_submap[seen.submap].scale, noise) for seen in straight]
     known = [_straightened(prior, bending) for prior in priors]
     agreeing = consistent_priors(known, submap_edges(straight, state, noise)) if known else []

@@ -59,13 +59,12 @@ def misfits_at_camera(nodes: Mapping[int, Sim3], sightings: Sequence[Sighting]) 
     return steps
 
 
-def view_noise(nodes: Mapping[int, Sim3], sightings: Sequence[Sighting], least_position: float) -> ViewNoise:
-    """Return what the misfits of the sightings at given poses show of the noise of one view.
+def view_noise(misfits: Float, sightings: Sequence[Sighting], least_position: float) -> ViewNoise:
+    """Return what the misfits (N, 7) of the sightings show of the noise of one view.
 
     Medians, so that views placed wrong do not count. Where frames and submaps follow few sightings, these fit better
     than they are good: the unknowns' share is added.
     """
-    misfits = misfits_at_camera(nodes, sightings)
     grow = np.sqrt(len(sightings) / max(len(sightings) - fitted(sightings), 1))
     rotation, position = (
         np.sqrt(np.median((misfits[:, k : k + 3] ** 2).mean(axis=1)) / MEDIAN_OF_THREE) for k in (0, 3)
