@@ -31,7 +31,8 @@ from onthefly3r.run import reconstruct
 
 MIN_COSINE = 0.82  # of mutual nearest neighbours, as upstream has it
 MIN_CONFIDENCE = 0.1  # of LighterGlue, as upstream has it
-VARIANTS = {"sift": 4000, "xfeat-mutual": 4000, "xfeat-lighterglue": 2000, "xfeat-lighterglue-4000": 4000}
+LEARNED = {"xfeat-mutual": 4000, "xfeat-lighterglue": 2000, "xfeat-lighterglue-4000": 4000}  # most features
+VARIANTS = ("sift", *LEARNED)
 
 
 class XFeatStore:
@@ -114,7 +115,7 @@ class LearnedBackbone(ClassicalBackbone):
 
     def __init__(self, options: BackboneOptions) -> None:
         super().__init__(options)
-        self._features = XFeatStore(VARIANTS[options.backbone])  # type: ignore[assignment]
+        self._features = XFeatStore(LEARNED[options.backbone])  # type: ignore[assignment]
         self._matcher = LearnedMatcher(self._threads, "lighterglue" in options.backbone)
 
 
@@ -140,14 +141,13 @@ def main() -> int:
     """Measure every variant on every set that is named."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sets", nargs="+", type=Path, help="folder with photos/ and reference/")
-    parser.add_argument("--variant", action="append", choices=tuple(VARIANTS), help="default: all of them")
+    parser.add_argument("--variant", action="append", choices=VARIANTS, help="default: all of them")
     parser.add_argument("--work", type=Path, default=Path("benchmark-work"), help="scratch folder")
     parser.add_argument("--limit", type=int, help="only the first photographs of each set")
     parser.add_argument("--threads", type=int, default=0, help="processor cores to use; 0 takes all")
     chosen = parser.parse_args()
-    for name in VARIANTS:
-        if name != "sift":
-            registry.BUILT_IN[name] = f"{__name__}:{LearnedBackbone.__name__}"
+    for name in LEARNED:
+        registry.BUILT_IN[name] = f"{__name__}:{LearnedBackbone.__name__}"
     print("| set | features | coverage | ATE % | ARE deg | s/image | of it backbone |\n|---|---|---|---|---|---|---|")
     for folder in chosen.sets:
         for variant in chosen.variant or VARIANTS:

@@ -20,7 +20,7 @@ from ..geometry.transforms import Rigid3, Sim3
 from ..records import Observations, Shot
 from .state import MapState
 
-OBSERVATIONS = 20_000  # to aim at in all: a small map uses all that it has,
+OBSERVATIONS = 40_000  # to aim at in all: a small map uses all that it has,
 CELLS = 6  # an image at least
 LEAST_PER_CELL = 3  # of its longest tracks in each of 6 x 6 cells
 MIN_IMAGES = 3
