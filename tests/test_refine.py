@@ -12,7 +12,7 @@ import synthetic_block as synthetic
 from onthefly3r.geometry.camera import PixelMap
 from onthefly3r.geometry.transforms import Rigid3, Sim3, rotation_angle_deg, rotation_exp
 from onthefly3r.geometry.umeyama import weighted_similarity
-from onthefly3r.mapping.refine import CELLS, OBSERVATIONS, Tracks, chosen_tracks, joined_tracks, refine
+from onthefly3r.mapping.refine import Tracks, chosen_tracks, joined_tracks, refine
 from onthefly3r.mapping.state import MapState
 from onthefly3r.mapping.store import Store
 from onthefly3r.records import CompactReference, Frame, NewFrame, Observations, Submap
@@ -173,7 +173,7 @@ def test_long_tracks_spread_over_the_image_are_chosen() -> None:
     tracks = Tracks(image, pixel, np.full(len(image), np.nan), point, np.zeros((pairs + 1, 3)))
     chosen = chosen_tracks(tracks, dict.fromkeys(range(10)))
     counts = np.bincount(chosen.image)
-    assert counts[0] == OBSERVATIONS // (10 * CELLS**2) + 1  # the cell's share of the pairs, and the long track
+    assert counts[0] == 112  # 40,000 observations over 10 images of 36 cells are 111 pairs, and the long track
     assert len(counts) == 2  # the others keep a single observation, too few to move them
 
 
