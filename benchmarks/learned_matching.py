@@ -20,14 +20,14 @@ import numpy as np
 
 from onthefly3r.backbones import registry
 from onthefly3r.backbones.classical import ClassicalBackbone
-from onthefly3r.backbones.colmap import load_pycolmap
-from onthefly3r.backbones.matching import PairMatcher
 from onthefly3r.errors import ReconstructionError
-from onthefly3r.evaluate.run import evaluate
+from onthefly3r.evaluate.comparison import evaluate
+from onthefly3r.features.matching import PairMatcher
+from onthefly3r.features.pycolmap_module import load_pycolmap
 from onthefly3r.geometry.arrays import Float
 from onthefly3r.options import BackboneOptions, Options
 from onthefly3r.records import Features, WorkingImage
-from onthefly3r.run import reconstruct
+from onthefly3r.run.session import reconstruct
 
 MIN_COSINE = 0.82  # of mutual nearest neighbours, as upstream has it
 MIN_CONFIDENCE = 0.1  # of LighterGlue, as upstream has it

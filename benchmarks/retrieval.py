@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from onthefly3r.backbones.features import FeatureStore
 from onthefly3r.evaluate.readers import read_poses, scene_depth
+from onthefly3r.features.extraction import FeatureStore
 from onthefly3r.geometry.arrays import Bool, Float
 from onthefly3r.intake.folder import read_photographs
 from onthefly3r.intake.images import load_working_image

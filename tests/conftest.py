@@ -8,7 +8,7 @@ from types import ModuleType
 
 import pytest
 
-from onthefly3r.doctor import PACKAGES, check_package
+from onthefly3r.commands.doctor import PACKAGES, check_package
 
 ROOT = Path(__file__).resolve().parents[1]
 

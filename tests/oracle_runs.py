@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from onthefly3r.engine import Engine
+from onthefly3r.engine.loop import Engine
 from onthefly3r.geometry.transforms import Sim3, rotation_angle_deg
 from onthefly3r.geometry.umeyama import weighted_similarity
 from onthefly3r.options import Options

@@ -22,20 +22,20 @@ HEAVY = {"PIL", "cv2", "embreex", "gtsam", "laspy", "matplotlib", "open3d", "pyc
 HEAVY |= {"scipy", "shapefile", "torch", "trimesh"}
 
 # A module imports only from layers above its own; modules of one sub-package may import each other.
-FOUNDATION = {"errors", "options", "protocol", "geometry", "stopwatch"}
-COMMAND_LINE = {"cli", "command_options", "console"}
+FOUNDATION = {"errors", "options", "protocol", "geometry", "stopwatch", "files"}
 LAYERS = (
     FOUNDATION,
     {"records", "networks"},
-    {"intake", "selection", "backbones", "registration", "evaluate"},
-    {"mapping"},
-    {"export"},
-    {"simulate"},
-    {"engine", "products", "flying_height", "estimate"},
-    {"run", "check"},
-    {"batch"},
-    {"demo", "doctor", "viewer"},
-    COMMAND_LINE,
+    {"intake", "features"},
+    {"adjust"},
+    {"selection", "backbones", "registration", "evaluate"},
+    {"map"},
+    {"earth", "cloud"},
+    {"graph"},
+    {"products"},
+    {"simulate", "engine"},
+    {"run"},
+    {"commands"},
     {"__main__"},
 )
 
@@ -78,8 +78,33 @@ def test_module_keeps_to_its_layer(path: Path) -> None:
         assert not [node for node in top if isinstance(node, ast.ImportFrom) and node.level]
         return
     for other in imported_parts(path) - {own}:
-        together = any({own, other} <= layer for layer in (FOUNDATION, COMMAND_LINE))
+        together = {own, other} <= FOUNDATION
         assert rank(other) < rank(own) or together, f"{own} imports {other}"
+
+
+def imported_modules(path: Path) -> set[Path]:
+    """Files of the package that a file imports when it is loaded, not when a function of it is called."""
+    parents = path.relative_to(PACKAGE).parts[:-1]
+    found = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ImportFrom) and node.level:
+            base = PACKAGE.joinpath(*parents[: len(parents) - (node.level - 1)], *(node.module or "").split("."))
+            for candidate in (base.with_suffix(".py"), *(base / f"{alias.name}.py" for alias in node.names)):
+                if candidate.is_file():
+                    found.add(candidate)
+    return found
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    from graphlib import TopologicalSorter
+
+    graph = {path: imported_modules(path) for path in MODULES if path.name != "__init__.py"}
+    assert len(list(TopologicalSorter(graph).static_order())) >= len(graph)  # raises CycleError
+
+
+def test_no_two_modules_have_the_same_name() -> None:
+    names = [path.name for path in MODULES if path.name != "__init__.py"]
+    assert sorted(set(names)) == sorted(names)
 
 
 def test_layers_name_every_part() -> None:
@@ -117,7 +142,7 @@ def test_help_loads_nothing_heavy() -> None:
     show_help = "\n".join(
         [
             "import contextlib, io",
-            "from onthefly3r.cli import app",
+            "from onthefly3r.commands.cli import app",
             "with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):",
             "    app(['run', '-h'])",
         ]
@@ -135,7 +160,7 @@ def test_importing_a_module_loads_nothing_heavy() -> None:
 
 
 def test_doctor_knows_every_requirement() -> None:
-    from onthefly3r.doctor import PACKAGES
+    from onthefly3r.commands.doctor import PACKAGES
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from onthefly3r.backbones.classical import ClassicalBackbone
-from onthefly3r.backbones.features import FeatureStore
-from onthefly3r.backbones.matching import PairMatcher, mutual_matches
+from onthefly3r.features.extraction import FeatureStore
+from onthefly3r.features.matching import PairMatcher, mutual_matches
 from onthefly3r.geometry.camera import Camera, PixelMap
 from onthefly3r.geometry.transforms import Sim3, rotation_angle_deg
 from onthefly3r.geometry.umeyama import weighted_similarity

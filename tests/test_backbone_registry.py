@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from onthefly3r import doctor
 from onthefly3r.backbones import registry
 from onthefly3r.backbones.listing import available_backbones, backbones_text
 from onthefly3r.backbones.registry import backbone_targets, create_backbone, load_backbone
 from onthefly3r.backbones.torch_runtime import ModelCard, TorchBackbone
-from onthefly3r.cli import app
+from onthefly3r.commands import doctor
+from onthefly3r.commands.cli import app
 from onthefly3r.errors import MissingDependencyError, OptionError
 from onthefly3r.networks.weights import find_weights
 from onthefly3r.options import BackboneOptions

@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 
-from onthefly3r import batch
-from onthefly3r.batch import Flight, read_flights, reconstruct_flights
+from onthefly3r.commands import batch
+from onthefly3r.commands.batch import Flight, read_flights, reconstruct_flights
 from onthefly3r.errors import Cancelled, InputError
 from onthefly3r.options import Options
 from onthefly3r.protocol import Job, Progress

@@ -15,9 +15,9 @@ import pytest
 from PIL import Image, ImageFilter
 from typer.testing import CliRunner
 
-from onthefly3r import estimate
-from onthefly3r.check import CheckedPhotograph, check_photographs, write_check
-from onthefly3r.cli import app
+from onthefly3r.commands import estimate
+from onthefly3r.commands.check import CheckedPhotograph, check_photographs, write_check
+from onthefly3r.commands.cli import app
 from onthefly3r.errors import Cancelled, InputError
 from onthefly3r.options import Options
 from onthefly3r.protocol import Progress

@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from onthefly3r.cli import app
+from onthefly3r.commands.cli import app
 from onthefly3r.errors import Cancelled, GeoreferenceError
 from onthefly3r.options import Options, iterate_options
 from onthefly3r.protocol import Event, Progress
@@ -65,11 +65,11 @@ class FakeEngine:
 @pytest.fixture
 def engine(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeEngine]:
     fake = FakeEngine()
-    module = types.ModuleType("onthefly3r.run")
+    module = types.ModuleType("onthefly3r.run.session")
     module.reconstruct = fake.reconstruct  # type: ignore[attr-defined]
     module.export_again = fake.export_again  # type: ignore[attr-defined]
     module.earlier_options = lambda run: {"vertical": "egm96", "spacing_m": 0.25}  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "onthefly3r.run", module)
+    monkeypatch.setitem(sys.modules, "onthefly3r.run.session", module)
     yield fake
 
 
@@ -221,7 +221,7 @@ def test_unexpected_error_leaves_a_traceback_in_work(engine: FakeEngine, tmp_pat
 
 SLOW_ENGINE = """
 import sys, time, types
-engine = types.ModuleType("onthefly3r.run")
+engine = types.ModuleType("onthefly3r.run.session")
 def reconstruct(photos, out, options, progress, cancel):
     from onthefly3r.errors import Cancelled
     from onthefly3r.protocol import Progress
@@ -236,8 +236,8 @@ def reconstruct(photos, out, options, progress, cancel):
         os.write(2, b"the engine tidied up\\n")
         raise
 engine.reconstruct = reconstruct
-sys.modules["onthefly3r.run"] = engine
-from onthefly3r.cli import main
+sys.modules["onthefly3r.run.session"] = engine
+from onthefly3r.commands.cli import main
 sys.argv = ["onthefly3r", *sys.argv[1:]]
 main()
 """
@@ -280,7 +280,7 @@ def test_file_names_survive_a_console_without_unicode(tmp_path: Path) -> None:
 
 
 def test_doctor_reports_every_check_as_json() -> None:
-    from onthefly3r.doctor import PACKAGES
+    from onthefly3r.commands.doctor import PACKAGES
 
     shown = call("doctor", "--json")
     told = json.loads(shown.stdout)
@@ -294,7 +294,7 @@ def test_doctor_reports_every_check_as_json() -> None:
 
 
 def test_doctor_reports_crashing_and_broken_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from onthefly3r import doctor
+    from onthefly3r.commands import doctor
 
     (tmp_path / "crashes_on_import.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGABRT)\n")
     lacking = "raise ImportError('libEGL.so.1: cannot open shared object file: No such file or directory')\n"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from onthefly3r.demo import compare_with_truth, run_demo
+from onthefly3r.commands.demo import compare_with_truth, run_demo
 from onthefly3r.errors import Cancelled, InputError
 from onthefly3r.geometry.frames import omega_phi_kappa_deg
 from onthefly3r.geometry.geodesy import EnuFrame, WorldFrame
@@ -91,9 +91,9 @@ def engine(monkeypatch: pytest.MonkeyPatch) -> None:
         assert len(list(photos.glob("*.JPG"))) == SMALL.images
         return write_shifted_truth(plan_survey(SMALL), out, noise_m=0.0)
 
-    module = types.ModuleType("onthefly3r.run")
+    module = types.ModuleType("onthefly3r.run.session")
     module.reconstruct = reconstruct  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "onthefly3r.run", module)
+    monkeypatch.setitem(sys.modules, "onthefly3r.run.session", module)
 
 
 def test_demo_renders_reconstructs_and_measures(engine: None, tmp_path: Path) -> None:

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from onthefly3r.engine import Engine
+from onthefly3r.engine.loop import Engine
 from onthefly3r.errors import Cancelled, PhotographError
-from onthefly3r.mapping.state import MapState
-from onthefly3r.mapping.store import Store
+from onthefly3r.map.state import MapState
+from onthefly3r.map.store import Store
 from onthefly3r.options import Options
 from onthefly3r.records import LocalModel, Rejection, Subset
 from onthefly3r.simulate.oracle import Faults, OracleBackbone, OracleDescriber, oracle_shots

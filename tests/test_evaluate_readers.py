@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from onthefly3r.errors import ReferenceFormatError
 from onthefly3r.evaluate.readers import read_poses, scene_depth
-from onthefly3r.export.colmap import SparsePoints, write_model
-from onthefly3r.export.rows import placed_row, rejected_row
-from onthefly3r.export.trajectory import write_trajectory
 from onthefly3r.geometry.camera import Camera
 from onthefly3r.geometry.frames import omega_phi_kappa_deg, world_from_cam_rotation
 from onthefly3r.geometry.transforms import Rigid3, rotation_exp
+from onthefly3r.products.colmap import SparsePoints, write_model
+from onthefly3r.products.rows import placed_row, rejected_row
+from onthefly3r.products.trajectory_table import write_trajectory
 from onthefly3r.records import PlacedCamera, Shot
 
 CAMERA = Camera(1600, 900, 950.0, 950.0, 800.0, 450.0)

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from onthefly3r.backbones.features import FeatureStore
 from onthefly3r.errors import MissingDependencyError, OptionError
+from onthefly3r.features.extraction import FeatureStore
 from onthefly3r.geometry.camera import PixelMap
 from onthefly3r.networks import efficientnet
 from onthefly3r.options import SelectionOptions
 from onthefly3r.records import Shot, WorkingImage
 from onthefly3r.selection import neural
-from onthefly3r.selection.choice import create_describer
+from onthefly3r.selection.describer import create_describer
 from onthefly3r.selection.descriptors import VladDescriber
 from onthefly3r.selection.neural import EfficientNetDescriber, MegaLocDescriber, SupSceneDescriber
 

@@ -20,8 +20,8 @@ pytest.importorskip("safetensors", reason="safetensors is not installed")
 from typer.testing import CliRunner  # noqa: E402
 
 from fake_backbone import GAIN, TruthBackbone, install  # noqa: E402 - needs torch
-from onthefly3r.cli import app  # noqa: E402
-from onthefly3r.evaluate.run import evaluate  # noqa: E402
+from onthefly3r.commands.cli import app  # noqa: E402
+from onthefly3r.evaluate.comparison import evaluate  # noqa: E402
 from onthefly3r.simulate import SurveyOptions, simulate_survey  # noqa: E402
 
 IMAGES = 14
@@ -104,7 +104,7 @@ def test_from_photographs_to_files(survey_folder: Path, weights: Path, tmp_path:
 
 def test_memory_is_told_by_stage(survey_folder: Path, weights: Path, tmp_path: Path) -> None:
     program = (
-        "from onthefly3r.cli import main\n"
+        "from onthefly3r.commands.cli import main\n"
         "from onthefly3r.simulate.flight import SurveyOptions, plan_survey\n"
         "from fake_backbone import TruthBackbone\n"
         f"TruthBackbone.survey = plan_survey(SurveyOptions(**{SURVEY!r}))\n"

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from onthefly3r.evaluate.trajectory import pose_errors
+from onthefly3r.evaluate.trajectory_errors import pose_errors
 from onthefly3r.geometry.transforms import Rigid3, Sim3, rotation_exp
-from onthefly3r.mapping.store import Store
+from onthefly3r.map.store import Store
 from onthefly3r.records import Subset
 from onthefly3r.selection.index import RetrievalIndex
 from onthefly3r.simulate.oracle import Faults, Noise, OracleBackbone, OracleDescriber

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from onthefly3r import Options, reconstruct
-from onthefly3r.batch import Flight, read_flights
+from onthefly3r.commands.batch import Flight, read_flights
 from onthefly3r.errors import Cancelled, GeoreferenceError, InputError, OptionError, ReconstructionError
-from onthefly3r.evaluate.run import evaluate
+from onthefly3r.evaluate.comparison import evaluate
 from onthefly3r.intake.folder import read_photographs
 from onthefly3r.options import IntakeOptions
 from onthefly3r.protocol import Progress
-from onthefly3r.run import Result, export_again
+from onthefly3r.run.session import Result, export_again
 from onthefly3r.simulate import SurveyOptions, simulate_survey
 
 FAST = {"dense_px": 200, "threads": 2}

@@ -11,9 +11,9 @@ import pytest
 
 from onthefly3r import Options, reconstruct
 from onthefly3r.errors import GeoreferenceError
+from onthefly3r.evaluate.comparison import EvaluationReport, evaluate
 from onthefly3r.evaluate.readers import read_poses, read_trajectory_csv
-from onthefly3r.evaluate.run import EvaluationReport, evaluate
-from onthefly3r.run import export_again
+from onthefly3r.run.session import export_again
 
 pytestmark = pytest.mark.photographs
 

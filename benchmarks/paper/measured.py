@@ -16,7 +16,7 @@ from onthefly3r.errors import InputError, ReferenceFormatError
 from onthefly3r.evaluate.clouds import open_cloud
 from onthefly3r.evaluate.poses import PoseSet, match
 from onthefly3r.evaluate.surface import SurfaceErrors, surface_errors
-from onthefly3r.evaluate.trajectory import PoseErrors, pose_errors
+from onthefly3r.evaluate.trajectory_errors import PoseErrors, pose_errors
 from onthefly3r.geometry.transforms import Rigid3
 
 from .datasets import Scene

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from onthefly3r.geometry.transforms import Rigid3, Sim3
-from onthefly3r.mapping.journal import rigid3_from_json, sim3_from_json, submap_from_json
-from onthefly3r.mapping.store import Store
+from onthefly3r.map.journal import rigid3_from_json, sim3_from_json, submap_from_json
+from onthefly3r.map.store import Store
 from onthefly3r.records import Frame
 
 

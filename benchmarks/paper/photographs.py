@@ -9,16 +9,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from onthefly3r.backbones.features import FeatureStore
 from onthefly3r.backbones.registry import create_backbone
 from onthefly3r.evaluate.poses import PoseSet, match
 from onthefly3r.evaluate.readers import read_poses, scene_depth
-from onthefly3r.evaluate.trajectory import pose_errors
+from onthefly3r.evaluate.trajectory_errors import pose_errors
+from onthefly3r.features.extraction import FeatureStore
 from onthefly3r.geometry.transforms import Rigid3
 from onthefly3r.intake.folder import read_photographs
 from onthefly3r.intake.images import load_working_image
 from onthefly3r.options import Options
-from onthefly3r.selection.choice import create_describer
+from onthefly3r.selection.describer import create_describer
 
 from .results import write_result
 from .simulated import pose_file, read_rows

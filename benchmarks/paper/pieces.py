@@ -12,7 +12,7 @@ import numpy as np
 
 from onthefly3r.geometry.arrays import Float
 from onthefly3r.geometry.transforms import Rigid3, Sim3
-from onthefly3r.mapping.posegraph import default_solver
+from onthefly3r.graph.posegraph import default_solver
 from onthefly3r.records import Correspondences, Edge, LocalModel, LocalView, Rejection
 from onthefly3r.registration.align import align
 

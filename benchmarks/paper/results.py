@@ -87,7 +87,7 @@ def _read_npz(path: Path, images: Sequence[str]) -> PoseSet:
 
 def _read_colmap_binary(folder: Path) -> PoseSet:
     """Read images.bin by pycolmap, images ordered by name."""
-    from onthefly3r.backbones.colmap import load_pycolmap
+    from onthefly3r.features.pycolmap_module import load_pycolmap
 
     try:
         model = load_pycolmap().Reconstruction(str(folder))

@@ -8,7 +8,7 @@ from typing import Any
 
 from onthefly3r.errors import InputError
 from onthefly3r.options import Options
-from onthefly3r.run import reconstruct
+from onthefly3r.run.session import reconstruct
 
 from .datasets import Scene
 from .measured import SceneResult, measure

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from onthefly3r.evaluate.poses import PoseSet
-from onthefly3r.evaluate.trajectory import pose_errors
+from onthefly3r.evaluate.trajectory_errors import pose_errors
 from onthefly3r.geometry.transforms import Rigid3
 from onthefly3r.records import Shot, WorkingImage
 from onthefly3r.simulate.flight import Survey, SurveyOptions, TrueView, plan_survey

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from onthefly3r.evaluate.poses import PoseSet
-from onthefly3r.evaluate.trajectory import pose_errors
+from onthefly3r.evaluate.trajectory_errors import pose_errors
 
 from .published import ABLATION
 from .results import read_result

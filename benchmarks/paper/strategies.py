@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from onthefly3r.backbones.base import Backbone, BackboneSpec, ExtractsFeatures
-from onthefly3r.engine import Engine
+from onthefly3r.engine.loop import Engine
 from onthefly3r.geometry.camera import Camera
 from onthefly3r.geometry.transforms import Rigid3
 from onthefly3r.intake.cache import ImageCache
 from onthefly3r.options import Options
 from onthefly3r.records import LocalModel, Rejection, Shot, Subset, WorkingImage
-from onthefly3r.selection.base import Describer
+from onthefly3r.selection.describer import Describer
 from onthefly3r.selection.index import RetrievalIndex
 
 from .chunks import place_chunks

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from .engine import Engine
+    from .engine.loop import Engine
     from .options import Options
-    from .run import Result, reconstruct
+    from .run.session import Result, reconstruct
 
 __all__ = ["Engine", "Options", "Result", "__version__", "reconstruct"]
 
 
-_HOMES = {"Engine": "engine", "Options": "options", "Result": "run", "reconstruct": "run"}
+_HOMES = {"Engine": "engine.loop", "Options": "options", "Result": "run.session", "reconstruct": "run.session"}
 
 
 def __getattr__(name: str) -> Any:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 from .geometry.arrays import Bool, Float, Int, UInt8
 from .geometry.camera import Camera, PixelMap
@@ -268,6 +268,47 @@ class Submap:
     sightings: tuple[Sighting, ...]
     frame_edges: tuple[FrameEdge, ...] = ()
     calibrations: Mapping[str, Camera] = field(default_factory=dict)  # first seen here; per camera key, photograph size
+
+
+class PlacedMap(Protocol):
+    """What stages that only read the map see of it: accepted frames, their poses and their compact references."""
+
+    spacing: float  # l_scene, map units
+
+    @property
+    def frames(self) -> Mapping[int, Frame]:
+        """Accepted frames by shot index, in the order of their acceptance."""
+        ...
+
+    @property
+    def map_from_submap(self) -> Mapping[int, Sim3]:
+        """Poses of the submaps by number."""
+        ...
+
+    @property
+    def calibrations(self) -> Mapping[str, Camera]:
+        """Intrinsics by camera key, photograph size."""
+        ...
+
+    def map_from_cam(self, index: int) -> Rigid3:
+        """Return the pose of an accepted frame."""
+        ...
+
+    def submap_pose_of(self, index: int) -> Sim3:
+        """Return map_from_submap as it holds for one frame."""
+        ...
+
+    def reference(self, index: int) -> CompactReference:
+        """Return H_i of an accepted frame, in the frame of its submap."""
+        ...
+
+    def next_submap(self) -> int:
+        """Return the number that the next committed batch gets."""
+        ...
+
+    def last_accepted(self, count: int) -> list[int]:
+        """Return the last frames of A_k in the order of their acceptance."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -14,15 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
+from ..adjust.selfcal import IntrinsicsPrior, self_calibrate
+from ..adjust.sparse_model import SparseModel
+from ..features.extraction import FeatureStore
+from ..features.matching import PairMatcher
 from ..geometry.camera import Camera, PixelMap
 from ..options import BackboneOptions
 from ..records import Features, LocalModel, LocalView, Observations, Rejection, Subset, WorkingImage
 from .base import BackboneSpec
 from .dense import dense_views, sparse_view
-from .features import FeatureStore
-from .local_sfm import SparseModel, local_sfm
-from .matching import PairMatcher
-from .selfcal import IntrinsicsPrior, self_calibrate
+from .local_sfm import local_sfm
 
 MIN_IMAGES_TO_CALIBRATE = 8  # fewer cannot tell focal length from depth: the prior is held
 

@@ -13,10 +13,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from ..adjust.sparse_model import SparseModel
 from ..geometry.arrays import Float, UInt8
 from ..geometry.camera import Camera
 from ..records import Features
-from .local_sfm import SparseModel
 from .rectify import rectify
 from .sparse import DenseView, precision_worth, ray_angles, sparse_view
 from .stereo import disparity

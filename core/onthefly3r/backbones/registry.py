@@ -8,9 +8,9 @@ from collections.abc import Callable
 from importlib import metadata
 
 from ..errors import MissingDependencyError, OptionError
+from ..features.extraction import FeatureStore
 from ..options import BackboneOptions
 from .base import Backbone
-from .features import FeatureStore
 
 GROUP = "onthefly3r.backbones"
 BUILT_IN = {

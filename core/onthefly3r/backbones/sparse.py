@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..adjust.sparse_model import SparseModel
 from ..geometry.arrays import Bool, Float, Int
 from ..records import Features
-from .local_sfm import SparseModel
 
 SIGMA_HALF_GSD = 2.5  # depth precision at which a point is worth half
 KEYPOINT_SIGMA_PX = 0.5

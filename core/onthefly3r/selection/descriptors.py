@@ -3,27 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
 
 import numpy as np
 
 from ..geometry.arrays import Float, UInt8
-from ..records import Features, WorkingImage
+from ..records import WorkingImage
+from .describer import LocalFeatures
 
 WORDS = 64
 TRAINING_FEATURES = 40_000
-
-
-class LocalFeatures(Protocol):
-    """Where the local features of images come from, by shot index."""
-
-    def extract(self, images: Mapping[int, WorkingImage]) -> None:
-        """Extract those of several images at once and keep them."""
-        ...
-
-    def features_of(self, index: int, image: WorkingImage) -> Features:
-        """Return those of one image, extracted on first demand."""
-        ...
 
 
 class VladDescriber:

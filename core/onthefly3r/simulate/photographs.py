@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..export.atomic import replacing
+from ..files.atomic import replacing
 from ..geometry.arrays import UInt8
 from .flight import TrueView
 from .scene import Scene

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..export.atomic import write_text
-from ..export.colmap import SparsePoints, write_model
-from ..export.las import write_cloud
+from ..files.atomic import write_text
 from ..geometry.arrays import Bool, Float, UInt8
 from ..geometry.geodesy import WorldFrame, utm_crs_for, wkt1
+from ..products.colmap import SparsePoints, write_model
+from ..products.las import write_cloud
 from ..records import CloudTile, PlacedCamera
 from .flight import Survey, TrueView, tag_vertical
 

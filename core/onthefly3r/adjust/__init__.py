@@ -1,0 +1,1 @@
+"""Bundle adjustment: cameras, points and intrinsics in one least squares."""

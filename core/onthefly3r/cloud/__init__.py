@@ -1,0 +1,1 @@
+"""The dense cloud: fused from point maps in bounded memory."""

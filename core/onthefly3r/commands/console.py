@@ -1,0 +1,264 @@
+"""How a command speaks to whoever started it: a progress bar or JSON lines, exit codes, Ctrl-C, crash notes."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import signal
+import sys
+import tempfile
+import threading
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, TextIO
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+from .. import protocol
+from ..errors import Cancelled, MissingDependencyError, OnTheFly3RError, ReconstructionError
+
+# Failures of the disk or of permissions: the user can mend them, a traceback would not help.
+_DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG)
+
+STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name)]
+
+
+class HumanReporter:
+    """A progress bar on standard error and the result as text on standard output."""
+
+    def __init__(self) -> None:
+        self.errors = Console(stderr=True, highlight=False)
+        self._stage = ""
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TaskProgressColumn(),
+            TextColumn("{task.fields[counts]}"),
+            TextColumn("{task.fields[left]}"),
+            TimeElapsedColumn(),
+            console=self.errors,
+        )
+        self._task = self._bar.add_task("starting", total=None, counts="", left="")
+
+    def __enter__(self) -> HumanReporter:
+        """Show the bar where there is a terminal to show it on."""
+        if self.errors.is_terminal:
+            self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Take the bar away."""
+        self._bar.stop()
+
+    def progress(self, report: protocol.Progress) -> None:
+        """Show how far the run is; without a terminal, one line per stage."""
+        counts = f"{report.placed} placed, {report.rejected} rejected, {report.waiting} waiting"
+        left = "" if report.eta_s is None else f"{_clock(report.eta_s)} left"
+        self._bar.update(
+            self._task,
+            description=report.stage,
+            completed=report.done,
+            total=report.total or None,
+            counts=counts if report.placed or report.rejected or report.waiting else report.message,
+            left=left,
+        )
+        if not self.errors.is_terminal and report.stage != self._stage:
+            print(report.stage, file=sys.stderr, flush=True)
+        self._stage = report.stage
+
+    def warning(self, message: str) -> None:
+        """Print a warning above the bar."""
+        self.errors.print(f"warning: {message}", style="yellow", markup=False, soft_wrap=True)
+
+    def error(self, message: str, exit_code: int) -> None:
+        """Print why the command ends."""
+        colour = "yellow" if exit_code == Cancelled.exit_code else "red"
+        self.errors.print(message, style=colour, markup=False, soft_wrap=True)
+
+    def result(self, data: dict[str, Any], text: str) -> None:
+        """Print the result; lines are not broken, so that a path stays whole."""
+        self._bar.stop()
+        print(text)
+
+
+class JsonReporter:
+    """One JSON object per line on standard output, and nothing else there."""
+
+    def __init__(self) -> None:
+        self._lines: TextIO = sys.stdout
+        self._kept = contextlib.ExitStack()
+
+    def __enter__(self) -> JsonReporter:
+        """Keep standard output for the events: what libraries print goes to standard error."""
+        if sys.stdout is sys.__stdout__:
+            self._lines.flush()
+            kept = os.dup(1)
+            self._lines = self._kept.enter_context(open(kept, "w", encoding="utf-8", newline="\n"))  # noqa: PTH123 - a descriptor
+            self._kept.callback(os.dup2, kept, 1)
+            os.dup2(2, 1)
+        self._kept.enter_context(contextlib.redirect_stdout(sys.stderr))
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Give standard output back."""
+        self._kept.close()
+
+    def _emit(self, event: protocol.Event) -> None:
+        self._lines.write(event.to_line() + "\n")
+        self._lines.flush()
+
+    def progress(self, report: protocol.Progress) -> None:
+        """Write a progress event."""
+        self._emit(protocol.Event.progress(report))
+
+    def warning(self, message: str) -> None:
+        """Write a warning event."""
+        self._emit(protocol.Event("warning", {"message": message}))
+
+    def error(self, message: str, exit_code: int) -> None:
+        """Write the event that says why the command ends."""
+        self._emit(protocol.Event("error", {"message": message, "exit_code": exit_code}))
+
+    def result(self, data: dict[str, Any], text: str) -> None:
+        """Write the result event."""
+        self._emit(protocol.Event("result", data))
+
+
+class Session:
+    """What a command works with: where it reports, and whether it was asked to stop."""
+
+    def __init__(self, reporter: HumanReporter | JsonReporter, polite: bool) -> None:
+        self.reporter = reporter
+        self.stop_asked = False
+        self._polite = polite
+        self._warned: set[str] = set()
+
+    def cancelled(self) -> bool:
+        """Return whether Ctrl-C or a termination signal arrived."""
+        return self.stop_asked
+
+    def progress(self, report: protocol.Progress) -> None:
+        """Pass a report on; raises `Cancelled` when the user asked to stop."""
+        # Importing pycolmap puts a handler of its own in place that ends the process with a stack trace.
+        self.listen_to_signals()
+        if self.stop_asked:
+            raise Cancelled("stopped on request")
+        self.reporter.progress(report)
+
+    def listen_to_signals(self) -> None:
+        """Let Ctrl-C and termination signals ask this session to stop; does nothing outside the main thread."""
+        if threading.current_thread() is threading.main_thread():
+            for number in STOP_SIGNALS:
+                signal.signal(number, self._stop)
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        if self.stop_asked or not self._polite:
+            raise KeyboardInterrupt
+        self.stop_asked = True
+
+    def warning(self, message: str) -> None:
+        """Tell a warning once."""
+        if message not in self._warned:
+            self._warned.add(message)
+            self.reporter.warning(message)
+
+
+@contextlib.contextmanager
+def session(*, json_lines: bool, out: Path | None = None, polite: bool = True) -> Iterator[Session]:
+    """Run a command's body: errors become one sentence and an exit code, never a traceback.
+
+    With `polite`, the first Ctrl-C or termination signal asks the work to stop at its next report and the second
+    ends it; without, the first ends it. `out` is the output folder: an unexpected error leaves its traceback there.
+    """
+    with JsonReporter() if json_lines else HumanReporter() as reporter:
+        here = Session(reporter, polite)
+        with _signals(here), _warnings_to(here):
+            try:
+                yield here
+                return
+            except OnTheFly3RError as error:
+                message, exit_code = str(error), error.exit_code
+                if isinstance(error, ReconstructionError) and out and (out / "report.json").is_file():
+                    message += f"; the report is in {out / 'report.json'}"
+            except (KeyboardInterrupt, BrokenPipeError):
+                message, exit_code = "stopped on request", Cancelled.exit_code
+            except MemoryError:
+                message, exit_code = "not enough memory: lower --working-px or --dense-px, or close other programs", 1
+            except ImportError as error:
+                message = f"{error}: the command 'onthefly3r doctor' says what is missing and how to install it"
+                exit_code = MissingDependencyError.exit_code
+            except Exception as error:
+                if isinstance(error, OSError) and error.errno in _DISK_TROUBLE:
+                    message, exit_code = f"{error.strerror}: {error.filename or out}", 2
+                else:
+                    message = f"unexpected {type(error).__name__}: {error}; the traceback is in {_note_crash(out)}"
+                    exit_code = 1
+        with contextlib.suppress(BrokenPipeError):
+            reporter.error(message, exit_code)
+    raise typer.Exit(exit_code)
+
+
+@contextlib.contextmanager
+def _signals(here: Session) -> Iterator[None]:
+    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+    here.listen_to_signals()
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+@contextlib.contextmanager
+def _warnings_to(here: Session) -> Iterator[None]:
+    """Pass what the package logs as a warning to the user."""
+
+    class Handler(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            here.warning(record.getMessage())
+
+    logger = logging.getLogger("onthefly3r")
+    handler = Handler(logging.WARNING)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+def _note_crash(folder: Path | None) -> Path:
+    """Save the traceback in `folder`/work, or in the temporary folder where that cannot be written."""
+    text = traceback.format_exc()
+    for place in (folder / "work" if folder else None, Path(tempfile.gettempdir())):
+        with contextlib.suppress(OSError):
+            if place is not None:
+                place.mkdir(parents=True, exist_ok=True)
+                note = place / "crash.txt"
+                note.write_text(text, encoding="utf-8")
+                return note
+    sys.stderr.write(text)
+    return Path("standard error")
+
+
+def use_utf8() -> None:
+    """Let both streams carry any file name, on Windows consoles too."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(encoding="utf-8", errors="replace")
+
+
+def columns(facts: dict[str, str]) -> str:
+    """Return names and values as text in two columns."""
+    width = max(map(len, facts), default=0)
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in facts.items())
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d}"

@@ -1,0 +1,1 @@
+"""The online loop: images in, a validated and drift-free map out."""

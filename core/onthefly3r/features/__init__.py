@@ -1,0 +1,1 @@
+"""Local features of photographs, and matches between them."""

@@ -1,0 +1,153 @@
+"""The point cloud as LAS 1.4 point format 7 (ASPRS LAS 1.4 R15), plain or compressed, written as it arrives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from ..errors import ReconstructionError
+from ..files.atomic import replacing
+from ..geometry.arrays import Float
+from ..geometry.spacing import point_spacing
+from ..records import CloudTile
+
+# OGC WKT 1 of a cloud that is not tied to the Earth: readers that insist on a CRS (QGIS hangs without) get one.
+LOCAL_WKT1 = 'LOCAL_CS["Local frame, not georeferenced",LOCAL_DATUM["Local frame",0],UNIT["metre",1]]'
+MAX_POINT_SOURCE = 65_535  # 16 bit; 0 is reserved for the writing software (LAS 1.4 R15, table 15)
+INT32_RANGE = 2**31 - 1
+
+
+WINDOW_STRIDE = 100  # every so many points are looked at for the window
+WINDOW_TAIL = 0.005  # share of the points outside the window on each side
+
+
+@dataclass(frozen=True)
+class CloudSummary:
+    """What was written, in the CRS of the file, m."""
+
+    path: Path
+    points: int
+    bounds: tuple[float, float, float, float, float, float]  # min x, min y, min z, max x, max y, max z
+    window: tuple[float, float, float, float]  # min x, min y, max x, max y without the outermost points
+    mean_spacing_m: float
+
+
+def las_scale_m(spacing_m: float) -> float:
+    """Return the coordinate resolution for a point spacing: a millimetre, or the power of ten <= a tenth of it."""
+    return float(min(1e-3, 10.0 ** np.floor(np.log10(spacing_m / 10.0) + 1e-9)))
+
+
+def write_cloud(
+    path: Path,
+    tiles: Iterator[CloudTile],
+    wkt1: str | None,
+    scale_m: float,
+    description: str = "",
+    n_images: int = 0,
+) -> CloudSummary:
+    """Write the tiles one after the other and return what the file holds; `.laz` compresses, `.las` does not.
+
+    Red, green and blue are 16 bit (8 bit x 257). Point source id is the image number from 1 (shot index + 1); with
+    more images than it can count, it is 0 and the extra dimension `image` holds the number. Further extra dimensions:
+    `confidence` 0..255, `batch`, `n_views` (also in user data, which QGIS keeps). Every point is return 1 of 1 and
+    class 0. A `<name>.copc.laz` left beside by QGIS is removed, because QGIS would show it instead.
+
+    Args:
+        path: final name, ending in .las or .laz.
+        tiles: in the export frame, m; consumed once, one in memory at a time.
+        wkt1: OGC WKT 1 of the CRS; None writes `LOCAL_WKT1`.
+        scale_m: resolution of the stored coordinates, see `las_scale_m`.
+        description: text kept in the file (LASF_Spec record 3).
+        n_images: number of photographs given, decides where image numbers are kept.
+
+    Raises:
+        ReconstructionError: no tile has a point, or the coordinates do not fit 32 bit at this scale.
+    """
+    import laspy
+
+    tiles = iter(tile for tile in tiles if len(tile.points))
+    first = next(tiles, None)
+    if first is None:
+        raise ReconstructionError(
+            "the cloud has no points; lower min_confidence, or look at the rejected images in the report"
+        )
+    wide = n_images > MAX_POINT_SOURCE
+    header = _header(np.round(first.points.mean(axis=0)), scale_m, wkt1 or LOCAL_WKT1, description, wide)
+    spacing, count = 0.0, 0
+    sample: list[Float] = []
+    compress = path.suffix.lower() == ".laz"
+    with replacing(path) as temporary:
+        with laspy.open(temporary, mode="w", header=header, do_compress=compress) as writer:
+            tile: CloudTile | None = first
+            while tile is not None:
+                writer.write_points(_record(tile, header, wide))
+                sample.append(tile.points[::WINDOW_STRIDE, :2])
+                tile_spacing = point_spacing(tile.points)
+                if np.isfinite(tile_spacing):
+                    spacing, count = spacing + tile_spacing * len(tile.points), count + len(tile.points)
+                tile = next(tiles, None)
+            written = writer.header
+        path.with_name(f"{path.stem}.copc.laz").unlink(missing_ok=True)
+    low, high = np.quantile(np.concatenate(sample), [WINDOW_TAIL, 1.0 - WINDOW_TAIL], axis=0)
+    (min_x, min_y, min_z), (max_x, max_y, max_z) = (map(float, ends) for ends in (written.mins, written.maxs))
+    return CloudSummary(
+        path=path,
+        points=int(written.point_count),
+        bounds=(min_x, min_y, min_z, max_x, max_y, max_z),
+        window=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
+        mean_spacing_m=spacing / count if count else float("nan"),
+    )
+
+
+def _header(offset: Float, scale_m: float, wkt1: str, description: str, wide: bool) -> Any:
+    import laspy
+    from laspy.vlrs.known import WktCoordinateSystemVlr
+
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.scales = np.full(3, scale_m)
+    header.offsets = offset
+    header.generating_software = f"onthefly3r {__version__}"
+    header.system_identifier = "EXTRACTION"  # LAS 1.4 R15: derived data, not a sensor's own
+    extra = [("confidence", "uint8", "confidence, 255 = 1"), ("batch", "uint32", "batch of the image")]
+    extra.append(("n_views", "uint8", "images that saw the point"))
+    if wide:
+        extra.append(("image", "uint32", "image number from 1"))
+    header.add_extra_dims([laspy.ExtraBytesParams(name, kind, text) for name, kind, text in extra])
+    # Not header.add_crs: it writes WKT 2, which point formats 6-10 do not allow.
+    header.vlrs.append(WktCoordinateSystemVlr(wkt1))
+    header.global_encoding.wkt = True
+    if description:
+        text = description.encode("utf-8", errors="backslashreplace")[:65_000] + b"\0"
+        header.vlrs.append(laspy.VLR("LASF_Spec", 3, "Text area description", text))
+    return header
+
+
+def _record(tile: CloudTile, header: Any, wide: bool) -> Any:
+    import laspy
+
+    record = laspy.ScaleAwarePointRecord.zeros(len(tile.points), header=header)
+    stored = np.rint((tile.points - header.offsets) / header.scales)
+    if np.abs(stored).max() > INT32_RANGE:
+        reach_km = np.abs(tile.points - header.offsets).max() / 1000.0
+        raise ReconstructionError(
+            f"points {reach_km:.0f} km apart do not fit a LAS file with coordinates to {header.scales[0]:g} m; "
+            "export with a larger spacing_m"
+        )
+    record.X, record.Y, record.Z = (stored[:, axis].astype(np.int32) for axis in range(3))
+    record.red, record.green, record.blue = (tile.rgb[:, band].astype(np.uint16) * 257 for band in range(3))
+    views = np.clip(tile.views, 0, 255).astype(np.uint8)
+    record.return_number = record.number_of_returns = np.ones(len(tile.points), np.uint8)
+    record.user_data = record["n_views"] = views
+    record["confidence"] = np.rint(np.clip(tile.confidence, 0.0, 1.0) * 255.0).astype(np.uint8)
+    record["batch"] = tile.batch.astype(np.uint32)
+    image = tile.source.astype(np.int64) + 1
+    if wide:
+        record["image"] = image.astype(np.uint32)
+    else:
+        record.point_source_id = image.astype(np.uint16)
+    return record

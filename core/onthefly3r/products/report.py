@@ -1,0 +1,123 @@
+"""`report.json`: what went in, what came out, how well, how fast."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from .. import __version__
+from ..files.atomic import write_text
+from ..options import Options
+from ..records import GeoReference
+from .las import CloudSummary
+
+
+@dataclass(frozen=True)
+class RejectedImage:
+    """A photograph that is not in the result, the stage that refused it last and why."""
+
+    image: str
+    stage: str
+    reason: str
+    numbers: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Where the time went; own time is everything but the backbone."""
+
+    total_s: float
+    backbone_s: float
+    stages: Mapping[str, float] = field(default_factory=dict)  # s
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """All that the report is made from; None where a run did not get that far."""
+
+    options: Options
+    backbone: str
+    given: int  # photographs found
+    placed: int
+    rejected: Sequence[RejectedImage]
+    timing: Timing
+    georeference: GeoReference | None = None
+    cloud: CloudSummary | None = None
+    error: str | None = None  # why the run ended early
+    warnings: Sequence[str] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)  # further figures, JSON values
+    backbone_facts: Mapping[str, Any] = field(default_factory=dict)  # name, version, licence, weights
+    stage_memory: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # peaks by stage, MiB
+
+
+def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
+    """Return the report as JSON values: numbers that are not finite become None, paths their file name."""
+    geo, cloud, timing = run.georeference, run.cloud, run.timing
+    report: dict[str, Any] = {
+        "software": {"version": __version__, "backbone": run.backbone, "options": run.options.to_flat()},
+        "backbone": dict(run.backbone_facts),
+        "images": {
+            "given": run.given,
+            "placed": run.placed,
+            "rejected": [
+                {"image": r.image, "stage": r.stage, "reason": r.reason, "numbers": dict(r.numbers)}
+                for r in run.rejected
+            ],
+        },
+        "georeference": None
+        if geo is None
+        else {
+            "crs": geo.crs,
+            "vertical": geo.vertical,
+            "scale": geo.enu_from_map.scale,
+            "n_used": geo.n_used,
+            "n_outliers": geo.n_outliers,
+            "rmse_h_m": geo.rmse_h_m,
+            "rmse_v_m": geo.rmse_v_m,
+            "method": geo.method,
+        },
+        "cloud": None
+        if cloud is None
+        else {
+            "path": cloud.path.name,
+            "points": cloud.points,
+            "bounds": list(cloud.bounds),
+            "mean_spacing_m": cloud.mean_spacing_m,
+        },
+        "timing": {
+            "total_s": timing.total_s,
+            "per_image_s": timing.total_s / run.given if run.given else None,
+            "stages": dict(timing.stages),
+            "backbone_s": timing.backbone_s,
+            "own_s": timing.total_s - timing.backbone_s,
+        },
+        "memory": {"peak_rss_mib": peak_rss_mib, "stages": dict(run.stage_memory)},
+        "error": run.error,
+        "warnings": [*run.warnings, *(geo.warnings if geo else ())],
+        "details": dict(run.details),
+    }
+    return dict(_plain(report))
+
+
+def write_report(path: Path, report: Mapping[str, Any]) -> None:
+    """Write the report as strict JSON (no NaN), UTF-8, atomically."""
+    text = json.dumps(_plain(report), indent=2, ensure_ascii=False, allow_nan=False)
+    write_text(path, text + "\n")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):  # numpy
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    return str(value)
