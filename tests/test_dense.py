@@ -311,7 +311,7 @@ def test_partners_that_agree_are_averaged_others_are_doubted() -> None:
     nan = np.nan
     depths = [np.array([[10.0, 10.0, nan, nan]], np.float32), np.array([[10.02, 12.0, 9.0, nan]], np.float32)]
     sigmas = [np.full((1, 4), 0.01, np.float32), np.full((1, 4), 0.02, np.float32)]
-    merged = dense._merge(depths, sigmas, 1000.0)
+    merged = dense.merge_depths(depths, sigmas, 1000.0)
     np.testing.assert_allclose(merged.depth, [[10.004, 10.0, 9.0, nan]], rtol=1e-6)
     np.testing.assert_allclose(merged.sigma[0, :3], [0.01 / np.sqrt(1.25), 0.01, 0.02], rtol=1e-5)
     agreed, disputed, alone, unknown = merged.trust[0]
@@ -323,7 +323,7 @@ def test_confidence_is_trust_times_precision() -> None:
     depth, trust = np.full((80, 100), 10.0, np.float32), np.full((80, 100), 0.7, np.float32)
     gsd = 10.0 / CAMERA.fx
     for sigma_gsd, expected in ((0.0, 0.7), (2.5, 0.35), (250.0, 0.0)):
-        depth_map = dense._DepthMap(depth, np.full_like(depth, sigma_gsd * gsd), trust)
+        depth_map = dense.DepthMap(depth, np.full_like(depth, sigma_gsd * gsd), trust)
         view = dense._to_view(0, depth_map, model, {0: "a"})
         np.testing.assert_allclose(view.confidence, expected, atol=1e-3)
         np.testing.assert_allclose(view.points[..., 2], 10.0, rtol=1e-6)
@@ -337,7 +337,7 @@ def test_other_views_confirm_and_contradict() -> None:
     sigma, trust = np.full_like(wall, 0.01), np.full_like(wall, 0.7)
     spoilt = wall.copy()
     spoilt[40:44, 50:54], spoilt[20:24, 50:54] = 8.0, 12.0
-    maps = {0: dense._DepthMap(spoilt, sigma, trust), 1: dense._DepthMap(wall, sigma, trust)}
+    maps = {0: dense.DepthMap(spoilt, sigma, trust), 1: dense.DepthMap(wall, sigma, trust)}
     checked = dense._cross_check(0, maps, model, {0: "a", 1: "a"})
     np.testing.assert_array_equal(checked.depth, spoilt)
     assert (checked.trust[40:44, 50:54] < 0.3).all()

@@ -16,12 +16,23 @@ import numpy as np
 from ..adjust.sparse_model import SparseModel
 from ..geometry.arrays import Float, UInt8
 from ..geometry.camera import Camera
+from ..geometry.transforms import Rigid3
 from ..records import Features
 from .rectify import rectify
 from .sparse import DenseView, precision_worth, ray_angles, sparse_view
 from .stereo import disparity
 
-__all__ = ["DenseView", "choose_partners", "dense_view", "dense_views", "sparse_view"]
+__all__ = [
+    "DenseView",
+    "DepthMap",
+    "PosedImage",
+    "choose_partners",
+    "dense_view",
+    "dense_views",
+    "merge_depths",
+    "pair_depth",
+    "sparse_view",
+]
 
 BEST_ANGLE_DEG = 14.0  # between the rays of the two images: wide enough to be precise, small enough to match
 ANGLE_SPREAD = 0.6  # standard deviation of its logarithm
@@ -42,7 +53,16 @@ CHECKING_VIEWS = 2
 
 
 @dataclass(frozen=True)
-class _DepthMap:
+class PosedImage:
+    """A grey image and where it was taken."""
+
+    grey: UInt8  # (H, W)
+    camera: Camera  # at the size of the image
+    local_from_cam: Rigid3
+
+
+@dataclass(frozen=True)
+class DepthMap:
     """Depths of one view and how far they can be trusted."""
 
     depth: Float  # (H, W) float32 local units; NaN where unknown
@@ -136,7 +156,7 @@ def _depth_map(
     keys: Mapping[int, str],
     grid: tuple[int, int],
     partners: int,
-) -> _DepthMap:
+) -> DepthMap:
     camera = model.cameras[keys[index]]
     measured = [
         found
@@ -145,8 +165,8 @@ def _depth_map(
     ]
     if not measured:
         unknown = np.full((grid[1], grid[0]), np.nan, np.float32)
-        return _DepthMap(unknown, unknown, np.zeros_like(unknown))
-    return _merge([depth for depth, _ in measured], [sigma for _, sigma in measured], camera.fx)
+        return DepthMap(unknown, unknown, np.zeros_like(unknown))
+    return merge_depths([depth for depth, _ in measured], [sigma for _, sigma in measured], camera.fx)
 
 
 def _stereo_depth(
@@ -157,20 +177,36 @@ def _stereo_depth(
     keys: Mapping[int, str],
     grid: tuple[int, int],
 ) -> tuple[Float, Float] | None:
-    """Return depths and their standard deviations (H, W) from one pair, or None where it cannot be rectified."""
+    """Return what `pair_depth` finds for two images of a sparse model."""
     import cv2
 
-    left, right = model.cameras[keys[index]], model.cameras[keys[other]]
-    focal_px = min(1.0, FINER * grid[0] / left.width) * left.fx
+    left, right = (
+        PosedImage(cv2.cvtColor(images[i], cv2.COLOR_RGB2GRAY), model.cameras[keys[i]], model.local_from_cam[i])
+        for i in (index, other)
+    )
     points = model.points[model.tracks[index].points]
-    poses = model.local_from_cam[index], model.local_from_cam[other]
-    nearer = 1.0 + UNSEEN_RELIEF * _unseen_share(poses[0].inverse().apply(points), left)
-    pair = rectify(left, poses[0], right, poses[1], points, focal_px, nearer)
+    return pair_depth(left, right, points, left.camera.resized(*grid))
+
+
+def pair_depth(left: PosedImage, right: PosedImage, points: Float, grid: Camera) -> tuple[Float, Float] | None:
+    """Return depths and their standard deviations (H, W) float32 from one pair, None where it cannot be rectified.
+
+    Args:
+        left: the image whose depths are wanted.
+        right: its partner.
+        points: (N, 3) that the left image sees, local frame: they tell which depths to look for.
+        grid: camera of the depth map, at the pose of the left image; it may be free of distortion.
+    """
+    import cv2
+
+    focal_px = min(left.camera.fx, FINER * grid.fx)
+    poses = left.local_from_cam, right.local_from_cam
+    nearer = 1.0 + UNSEEN_RELIEF * _unseen_share(poses[0].inverse().apply(points), left.camera)
+    pair = rectify(left.camera, poses[0], right.camera, poses[1], points, focal_px, nearer)
     if pair is None:
         return None
-    grey = [cv2.cvtColor(images[i], cv2.COLOR_RGB2GRAY) for i in (index, other)]
-    found, found_sigma = disparity(*pair.images(grey[0], left, grey[1], right), pair.disparities)
-    xy, z = pair.pixels(_grid_rays(left.resized(*grid)))
+    found, found_sigma = disparity(*pair.images(left.grey, left.camera, right.grey, right.camera), pair.disparities)
+    xy, z = pair.pixels(_grid_rays(grid))
     x, y = np.ascontiguousarray(xy[..., 0]), np.ascontiguousarray(xy[..., 1])
     nearest, linear = (
         cv2.remap(found, x, y, how, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
@@ -198,7 +234,7 @@ def _grid_rays(camera: Camera) -> Float:
     return camera.rays(camera.pixel_centres()).astype(np.float32)
 
 
-def _merge(depths: Sequence[Float], sigmas: Sequence[Float], focal_px: float) -> _DepthMap:
+def merge_depths(depths: Sequence[Float], sigmas: Sequence[Float], focal_px: float) -> DepthMap:
     """Join the depths of several partners: the most precise one and those that agree with it, weighted."""
     depth = np.stack(depths)
     sigma = np.where(np.isfinite(depth), np.stack(sigmas), np.float32(np.inf))
@@ -214,10 +250,10 @@ def _merge(depths: Sequence[Float], sigmas: Sequence[Float], focal_px: float) ->
         mean_sigma = total**-0.5
     support, seen = agrees.sum(axis=0), np.isfinite(sigma).sum(axis=0)
     trust = np.where(support >= 2, TRUST_AGREED, np.where(seen >= 2, TRUST_DISPUTED, TRUST_ALONE))
-    return _DepthMap(mean, mean_sigma, np.where(seen > 0, trust, 0.0).astype(np.float32))
+    return DepthMap(mean, mean_sigma, np.where(seen > 0, trust, 0.0).astype(np.float32))
 
 
-def _cross_check(index: int, maps: Mapping[int, _DepthMap], model: SparseModel, keys: Mapping[int, str]) -> _DepthMap:
+def _cross_check(index: int, maps: Mapping[int, DepthMap], model: SparseModel, keys: Mapping[int, str]) -> DepthMap:
     """Let other views confirm a depth, or contradict it where they look through it."""
     import cv2
 
@@ -244,10 +280,10 @@ def _cross_check(index: int, maps: Mapping[int, _DepthMap], model: SparseModel, 
         trust_factor[seen & (difference < -2.0 * tolerance)] *= CONTRADICTED
     trust = own.trust.copy()
     trust[known] = (1.0 - (1.0 - trust[known]) * doubt_factor) * trust_factor
-    return _DepthMap(own.depth, own.sigma, trust)
+    return DepthMap(own.depth, own.sigma, trust)
 
 
-def _checking_views(index: int, maps: Mapping[int, _DepthMap], model: SparseModel) -> list[int]:
+def _checking_views(index: int, maps: Mapping[int, DepthMap], model: SparseModel) -> list[int]:
     """Return the views that share most sparse points."""
     own = model.tracks[index].points
     shared = {other: len(np.intersect1d(own, model.tracks[other].points)) for other in maps if other != index}
@@ -255,7 +291,7 @@ def _checking_views(index: int, maps: Mapping[int, _DepthMap], model: SparseMode
     return ranked[:CHECKING_VIEWS]
 
 
-def _points(index: int, depth_map: _DepthMap, model: SparseModel, keys: Mapping[int, str]) -> Float:
+def _points(index: int, depth_map: DepthMap, model: SparseModel, keys: Mapping[int, str]) -> Float:
     """Return the points (H, W, 3) float32 in the local frame."""
     import cv2
 
@@ -265,7 +301,7 @@ def _points(index: int, depth_map: _DepthMap, model: SparseModel, keys: Mapping[
     return np.asarray(cv2.transform(depth_map.depth[..., None] * rays, model.local_from_cam[index].matrix()[:3]))
 
 
-def _to_view(index: int, depth_map: _DepthMap, model: SparseModel, keys: Mapping[int, str]) -> DenseView:
+def _to_view(index: int, depth_map: DepthMap, model: SparseModel, keys: Mapping[int, str]) -> DenseView:
     known = np.isfinite(depth_map.depth)
     precision = precision_worth(depth_map.sigma, depth_map.depth, model.cameras[keys[index]].fx)
     confidence = np.where(known, precision * depth_map.trust, 0.0).astype(np.float32)
