@@ -134,6 +134,27 @@ def test_observations_name_what_was_seen(case: Case) -> None:
         assert np.median(np.linalg.norm(projected - found.pixel[rows], axis=1)) < 1.0
 
 
+class Stopped(Exception):
+    pass
+
+
+@pytest.mark.parametrize("after", [5, 30, 40])
+def test_work_ends_at_a_checkpoint_that_raises(case: Case, after: int) -> None:
+    """28 pairs, then about as many steps as there are images, then the images' depth."""
+    backbone = ClassicalBackbone(OPTIONS, case.backbone._features)
+    calls = []
+
+    def checkpoint() -> None:
+        calls.append(1)
+        if len(calls) > after:
+            raise Stopped
+
+    backbone.interrupt_with(checkpoint)
+    with pytest.raises(Stopped):
+        backbone.reconstruct(Subset((), tuple(range(8))), case.images, {})
+    assert len(calls) == after + 1
+
+
 def test_subset_without_overlap_is_rejected_with_numbers(case: Case, tmp_path: Path) -> None:
     blank = {i: WorkingImage(case.images[i].shot, np.full((450, 600, 3), 90, np.uint8), PixelMap()) for i in range(3)}
     rejection = ClassicalBackbone(OPTIONS, FeatureStore(tmp_path, 500)).reconstruct(Subset((), (0, 1, 2)), blank, {})

@@ -118,6 +118,9 @@ class Subset:
 
     references: tuple[int, ...]
     new: tuple[int, ...]
+    # How hard to try: 0 at first, 1 and more where an easier try found too little. A backbone may take more features,
+    # larger images and more starts then; it may also not care.
+    effort: int = 0
 
     @property
     def members(self) -> tuple[int, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -34,6 +34,15 @@ class ExtractsFeatures(Protocol):
 
     def extract_features(self, images: Mapping[int, WorkingImage]) -> None:
         """Extract and keep the features of new images, by shot index."""
+        ...
+
+
+@runtime_checkable
+class Interruptible(Protocol):
+    """A backbone whose single calls may take longer than a user who cancels should wait."""
+
+    def interrupt_with(self, checkpoint: Callable[[], None]) -> None:
+        """Call `checkpoint` every now and then while it works, at best each second; what it raises ends the work."""
         ...
 
 

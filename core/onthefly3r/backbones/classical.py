@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,6 +40,11 @@ class ClassicalBackbone:
             features = FeatureStore(Path(self._scratch.name), options.features, options.threads)
         self._features = features
         self._matcher = PairMatcher(self._threads)
+        self._checkpoint: Callable[[], None] = lambda: None
+
+    def interrupt_with(self, checkpoint: Callable[[], None]) -> None:
+        """Call `checkpoint` between pairs, between images and between the steps of a subset."""
+        self._checkpoint = checkpoint
 
     def extract_features(self, images: Mapping[int, WorkingImage]) -> None:
         """Extract the local features of new images, all at once."""
@@ -57,15 +62,17 @@ class ClassicalBackbone:
         features = {i: self.features_of(i, images[i]) for i in members}
         keys = {i: images[i].shot.camera_key for i in members}
         cameras = {keys[i]: _working_camera(images[i], calibrations) for i in members}
-        geometries = self._matcher.match(features, {i: cameras[keys[i]] for i in members}, members)
+        geometries = self._matcher.match(features, {i: cameras[keys[i]] for i in members}, members, self._checkpoint)
         held = frozenset(key for key in cameras if key in calibrations)
-        model = local_sfm(features, keys, cameras, held, geometries, self._threads)
+        model = local_sfm(features, keys, cameras, held, geometries, self._threads, self._checkpoint)
+        self._checkpoint()
         if model is None:
             verified = sum(len(g.inlier_matches) > 0 for g in geometries.values())
             numbers = {"images": float(len(members)), "verified_pairs": float(verified)}
             return Rejection(subset.new, "backbone", "too little overlap to reconstruct the subset", numbers)
         if not held >= set(cameras) and len(model.local_from_cam) >= MIN_IMAGES_TO_CALIBRATE:
             model = self._calibrate(model, features, keys, images, cameras, held)
+            self._checkpoint()
         return self._to_local_model(model, subset, images, features, keys, calibrations)
 
     def _calibrate(
@@ -94,7 +101,7 @@ class ClassicalBackbone:
         grids = {i: _grid_size(images[i], self._options.dense_px) for i in placed}
         new = [i for i in subset.new if i in placed]
         rgb = {i: images[i].rgb for i in placed}
-        dense = dense_views(new, rgb, model, keys, features, grids, threads=self._threads)
+        dense = dense_views(new, rgb, model, keys, features, grids, threads=self._threads, checkpoint=self._checkpoint)
         views = {}
         for index in placed:
             found = dense.get(index) or sparse_view(index, model, keys, features[index], grids[index])

@@ -6,7 +6,7 @@ is its depth over the focal length of the working image.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -79,6 +79,7 @@ def dense_views(
     grids: Mapping[int, tuple[int, int]],
     partners: int = 2,
     threads: int = 2,
+    checkpoint: Callable[[], None] = lambda: None,
 ) -> dict[int, DenseView]:
     """Return the point maps of those new images that the sparse model has placed, checked against each other.
 
@@ -93,12 +94,19 @@ def dense_views(
         grids: (width, height) of each new image's point map.
         partners: images that each new one is matched with, at most.
         threads: processor threads.
+        checkpoint: called between images; what it raises ends the work.
     """
     placed = [i for i in new if i in model.local_from_cam]
     with ThreadPoolExecutor(max(1, threads)) as pool:
-        maps = dict(
-            zip(placed, pool.map(lambda i: _depth_map(i, images, model, keys, grids[i], partners), placed), strict=True)
-        )
+        found = pool.map(lambda i: _depth_map(i, images, model, keys, grids[i], partners), placed)
+        maps = {}
+        try:
+            for i, depth_map in zip(placed, found, strict=True):
+                maps[i] = depth_map
+                checkpoint()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)  # else the end of `with` waits for all images
+            raise
         checked = pool.map(lambda i: _cross_check(i, maps, model, keys), placed)
         maps = dict(zip(placed, list(checked), strict=True))
     views = {}

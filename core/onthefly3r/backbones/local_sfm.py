@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -24,10 +24,12 @@ def local_sfm(
     held: frozenset[str],
     geometries: Mapping[tuple[int, int], Any],
     threads: int,
+    checkpoint: Callable[[], None] = lambda: None,
 ) -> SparseModel | None:
     """Return the largest model of the subset, or None when no three images hold together.
 
     Intrinsics of the camera keys in `held` stay as given; the others are refined in the bundle adjustment.
+    `checkpoint` is called after every image that was added; what it raises ends the work.
     """
     pycolmap = load_pycolmap()
 
@@ -36,7 +38,10 @@ def local_sfm(
     options = _pipeline_options(threads)
     options.constant_cameras = {camera_ids[key] for key in held if key in camera_ids}
     manager = pycolmap.ReconstructionManager()
-    pycolmap.IncrementalPipeline(options, cache, manager).run()
+    pipeline = pycolmap.IncrementalPipeline(options, cache, manager)
+    for event in pycolmap.IncrementalPipelineCallback.__members__.values():
+        pipeline.add_callback(int(event), checkpoint)
+    pipeline.run()
     models = [manager.get(i) for i in range(manager.size())]
     models = [model for model in models if model.num_reg_images() >= MIN_MODEL_SIZE]
     if not models:

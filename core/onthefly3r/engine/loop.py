@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..adjust.refine import refine
-from ..backbones.base import Backbone, ExtractsFeatures
+from ..backbones.base import Backbone, ExtractsFeatures, Interruptible
 from ..errors import Cancelled, PhotographError
 from ..geometry.arrays import Float
 from ..geometry.transforms import Sim3
@@ -101,6 +101,8 @@ class Engine:
         self._tie: GpsTie | None = None
         self._doubted: dict[int, Float] = {}  # where an image landed that its position does not confirm
         self._solver: PoseGraphSolver | None = None
+        if isinstance(backbone, Interruptible):
+            backbone.interrupt_with(self._stop_if_cancelled)
 
     @property
     def backbone_name(self) -> str:
@@ -444,9 +446,12 @@ class Engine:
                 self.state.move_refined(refined.map_from_submap, refined.calibrations)
                 self.refinement = refined.notes
 
-    def _checkpoint(self, stage: str, done: int, total: int) -> None:
+    def _stop_if_cancelled(self) -> None:
         if self._cancel is not None and self._cancel():
             raise Cancelled("stopped on request; run again to start anew")
+
+    def _checkpoint(self, stage: str, done: int, total: int) -> None:
+        self._stop_if_cancelled()
         if self._progress is None:
             return
         placed, rejected = len(self.state.frames), len(self.rejections)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -30,9 +30,16 @@ class PairMatcher:
         self._recent: OrderedDict[tuple[int, int], Any] = OrderedDict()
 
     def match(
-        self, features: Mapping[int, Features], cameras: Mapping[int, Camera], members: Sequence[int]
+        self,
+        features: Mapping[int, Features],
+        cameras: Mapping[int, Camera],
+        members: Sequence[int],
+        checkpoint: Callable[[], None] = lambda: None,
     ) -> dict[tuple[int, int], Any]:
-        """Return pycolmap two-view geometries of all pairs (i < j) of the members, indices into their features."""
+        """Return pycolmap two-view geometries of all pairs (i < j) of the members, indices into their features.
+
+        `checkpoint` is called between pairs; what it raises ends the work.
+        """
         pairs = [(min(p), max(p)) for p in itertools.combinations(members, 2)]
         missing = [pair for pair in pairs if pair not in self._recent]
         made = {i: to_pycolmap_camera(cameras[i], 1) for i in members}
@@ -41,7 +48,13 @@ class PairMatcher:
                 lambda pair: self._match_pair(features[pair[0]], made[pair[0]], features[pair[1]], made[pair[1]]),
                 missing,
             )
-            self._recent.update(zip(missing, geometries, strict=True))
+            try:
+                for pair, geometry in zip(missing, geometries, strict=True):
+                    self._recent[pair] = geometry
+                    checkpoint()
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)  # else the end of `with` waits for all pairs
+                raise
         found = {}
         for pair in pairs:
             self._recent.move_to_end(pair)
