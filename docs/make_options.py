@@ -28,7 +28,7 @@ def page() -> str:
     for name, options_class in slice_classes().items():
         parts.append(f"## {name.replace('_', ' ').capitalize()}\n")
         parts.append(str(options_class.__doc__).strip() + "\n")
-        parts.append("| option | default | unit | allowed | what it does |\n|---|---|---|---|---|")
+        parts.append("| option | default | unit | allowed | example | what it does |\n|---|---|---|---|---|---|")
         parts += [row(item) for item in dataclasses.fields(options_class)]
         parts.append("")
     parts.append("## What the preset `paper` changes\n")
@@ -44,8 +44,19 @@ def row(item: dataclasses.Field[Any]) -> str:
     bounds += [f"≤ {high}"] if high is not None else []
     allowed = ", ".join(facts["choices"] or bounds)
     meaning = facts["help"] + (" *(advanced)*" if facts["advanced"] else "")
-    cells = (f"`--{item.name.replace('_', '-')}`", shown(item.default), facts["unit"], allowed, meaning)
+    cells = (f"`--{item.name.replace('_', '-')}`", shown(item.default), facts["unit"], allowed, example(item), meaning)
     return "| " + " | ".join(cells) + " |"
+
+
+def example(item: dataclasses.Field[Any]) -> str:
+    """Return how the option is written with a value that is not the default."""
+    flag, facts, default = "--" + item.name.replace("_", "-"), item.metadata, item.default
+    if isinstance(default, bool):
+        return f"`--no-{flag[2:]}`" if default else f"`{flag}`"
+    value = facts["example"] or next((choice for choice in facts["choices"] if choice != default), "")
+    if not value and isinstance(default, int | float):
+        value = str(min(default * 2, facts["maximum"] or default * 2) or 1)
+    return f"`{flag} {value}`"
 
 
 def shown(value: object) -> str:

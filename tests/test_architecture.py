@@ -22,7 +22,7 @@ HEAVY = {"PIL", "cv2", "embreex", "gtsam", "laspy", "matplotlib", "open3d", "pyc
 HEAVY |= {"scipy", "shapefile", "torch", "trimesh"}
 
 # A module imports only from layers above its own; modules of one sub-package may import each other.
-FOUNDATION = {"errors", "options", "protocol", "geometry", "stopwatch", "files"}
+FOUNDATION = {"errors", "options", "option_fields", "protocol", "geometry", "stopwatch", "files"}
 LAYERS = (
     FOUNDATION,
     {"records", "networks"},

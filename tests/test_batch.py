@@ -15,9 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
 from onthefly3r.commands import batch
 from onthefly3r.commands.batch import Flight, read_flights, reconstruct_flights
+from onthefly3r.commands.cli import app
 from onthefly3r.errors import Cancelled, InputError
 from onthefly3r.options import Options
 from onthefly3r.protocol import Job, Progress
@@ -206,3 +208,21 @@ def test_command_line_ends_its_flight_when_it_is_told_to_stop(tmp_path: Path) ->
     assert lines[-1]["kind"] == "error" and "stopped on request" in lines[-1]["message"]
     with pytest.raises(ProcessLookupError):
         os.killpg(process.pid, 0)
+
+
+@pytest.mark.parametrize(("names", "exit_code"), [(("good",), 0), (("good", "wrong"), 3)])
+def test_exit_code_says_whether_a_flight_failed(
+    worker: Path, tmp_path: Path, names: tuple[str, ...], exit_code: int
+) -> None:
+    for name in names:
+        photographs(tmp_path / "day" / name)
+    shown = CliRunner().invoke(app, ["batch", str(tmp_path / "day"), str(tmp_path / "out")])
+    assert shown.exit_code == exit_code
+    assert ("1 of 2 flights failed: wrong" in shown.stderr) == (exit_code == 3)
+
+
+def test_a_named_option_wins_over_the_preset_even_if_it_is_the_default(worker: Path, tmp_path: Path) -> None:
+    options = Options.from_flat({"preset": "paper", "max_retries": 3})
+    reconstruct_flights(flights(tmp_path, "good"), tmp_path / "out", options)
+    (job,) = [json.loads(line) for line in worker.read_text().splitlines()]
+    assert job["options"] == {"preset": "paper", "max_retries": 3}

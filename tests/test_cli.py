@@ -174,7 +174,7 @@ def test_wrong_input_is_told_without_traceback(engine: FakeEngine, tmp_path: Pat
     cases = [
         ((tmp_path / "none", tmp_path / "out"), "does not exist"),
         ((photograph, tmp_path / "out"), "is a file"),
-        ((tmp_path, tmp_path / "out", "--seed-size", "1"), "least allowed value 3"),
+        ((tmp_path, tmp_path / "out", "--seed-size", "1"), "below the minimum of 3"),
         ((tmp_path, tmp_path / "out", "--pose-graph", "so3"), "se3"),
         ((tmp_path, tmp_path / "out", "--seed-size", "many"), "seed-size"),
         ((tmp_path,), "OUT"),

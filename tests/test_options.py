@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import runpy
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from onthefly3r.errors import OptionError
-from onthefly3r.options import PAPER_VALUES, Options, iterate_options
+from onthefly3r.options import PAPER_VALUES, ExportOptions, IntakeOptions, Options, iterate_options, over_earlier
+from onthefly3r.simulate import SurveyOptions
 
 ROOT = Path(__file__).resolve().parents[1]
 FIELDS = [item for _, item in iterate_options()]
@@ -92,3 +94,48 @@ def test_table_of_options_is_current() -> None:
     assert table == script["page"](), "run `make docs`"
     for item in FIELDS:
         assert f"`--{item.name.replace('_', '-')}`" in table
+
+
+@pytest.mark.parametrize("made", [lambda: IntakeOptions(limit=-5), lambda: SurveyOptions(images=2)])
+def test_no_slice_with_a_wrong_value_can_be_made(made: Callable[[], object]) -> None:
+    with pytest.raises(OptionError, match="minimum"):
+        made()
+
+
+def test_infinite_values_are_refused() -> None:
+    with pytest.raises(OptionError, match="finite"):
+        Options.from_flat({"gps_sigma_h_m": math.inf})
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"crs": "EPSG:32633", "local": True},
+        {"boundary": "field.geojson", "local": True},
+        {"weights": "a.safetensors"},
+        {"spacing_m": 0.1, "cloud": False},
+        {"descriptor_weights": "a.safetensors"},
+    ],
+)
+def test_options_without_effect_together_are_refused(values: dict[str, object]) -> None:
+    with pytest.raises(OptionError, match=next(iter(values))):
+        Options.from_flat(values)
+
+
+def test_a_named_value_wins_over_what_contradicts_it_in_an_earlier_run() -> None:
+    earlier = {"crs": "EPSG:32633", "format": "las"}
+    assert over_earlier(earlier, {"local": True}) == {"format": "las", "local": True}
+    assert over_earlier({"local": True}, {"crs": "EPSG:32633"}) == {"crs": "EPSG:32633"}
+
+
+def test_named_values_are_told_apart_from_defaults() -> None:
+    named = {"preset": "paper", "max_retries": 3}
+    assert Options.from_flat(named).to_named() == named
+    assert Options(export=ExportOptions(format="las")).to_named() == {"preset": "default", "format": "las"}
+
+
+def test_every_option_has_an_example() -> None:
+    script = runpy.run_path(str(ROOT / "docs" / "make_options.py"))
+    for item in FIELDS:
+        words = script["example"](item).strip("`").split()
+        assert len(words) == 2 or isinstance(item.default, bool), item.name

@@ -49,6 +49,12 @@ def test_job_survives_the_file(tmp_path_factory: pytest.TempPathFactory, words: 
     assert Job.read(path) == job
 
 
+def test_job_keeps_a_file_name_that_is_no_text(tmp_path: Path) -> None:
+    job = Job("run", (b"flight-\xff".decode("utf-8", "surrogateescape"), "out"))
+    job.write(tmp_path / "job.json")
+    assert Job.read(tmp_path / "job.json") == job
+
+
 def test_job_becomes_the_command_line_of_its_verb() -> None:
     options = {"crs": "EPSG:32633", "local": False, "recursive": True, "limit": None, "common_with": ["a", "b"]}
     words = Job("run", ("-photos", "öut"), options).words()

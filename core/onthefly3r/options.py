@@ -9,215 +9,258 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args, get_type_hints
+from typing import Any, Literal, get_args
 
 from .errors import OptionError
+from .option_fields import CheckedOptions, option
 
 Preset = Literal["default", "paper"]
 
 
-def option(
-    default: Any,
-    help: str,
-    *,
-    unit: str = "",
-    choices: tuple[str, ...] = (),
-    minimum: float | None = None,
-    maximum: float | None = None,
-    advanced: bool = False,
-) -> Any:
-    """Declare one option: `unit` and the bounds appear in every user interface and are checked."""
-    metadata = {
-        "help": help,
-        "unit": unit,
-        "choices": choices,
-        "minimum": minimum,
-        "maximum": maximum,
-        "advanced": advanced,
-    }
-    return field(default=default, metadata=metadata)
-
-
 @dataclass(frozen=True)
-class IntakeOptions:
+class IntakeOptions(CheckedOptions):
     """Which photographs are read, and how."""
 
-    recursive: bool = option(True, "look for photographs in sub-folders too")
-    min_side_px: int = option(200, "photographs with a shorter side are refused", unit="px", minimum=16, advanced=True)
-    focal_35mm: float | None = option(
-        None, "35-mm equivalent focal length; replaces what the EXIF tags say", unit="mm", minimum=1.0, advanced=True
+    recursive: bool = option(True, "read the photographs of sub-folders too")
+    min_side_px: int = option(
+        200, "minimum length of the shorter side; smaller photographs are refused", unit="px", minimum=16, advanced=True
     )
-    limit: int | None = option(None, "use only the first photographs in capture order", unit="images", minimum=1)
+    focal_35mm: float | None = option(
+        None,
+        "35-mm equivalent focal length; it replaces the value in the EXIF tags",
+        unit="mm",
+        minimum=1.0,
+        maximum=5000.0,
+        advanced=True,
+        example="24",
+    )
+    limit: int | None = option(
+        None,
+        "maximum number of photographs; the first ones in capture order are used",
+        unit="images",
+        minimum=1,
+        example="50",
+    )
     shuffle_seed: int | None = option(
-        None, "feed the photographs in a random order drawn from this seed", minimum=0, advanced=True
+        None,
+        "seed of a random order in which the photographs are used; default: capture order",
+        minimum=0,
+        advanced=True,
+        example="3",
     )
 
 
 @dataclass(frozen=True)
-class SelectionOptions:
+class SelectionOptions(CheckedOptions):
     """Seed, retrieval and dynamic subsets (paper Sec. III-B and III-C)."""
 
-    seed_size: int = option(30, "images of the first joint reconstruction (N0)", unit="images", minimum=3)
+    seed_size: int = option(30, "number of images in the first reconstruction (N0)", unit="images", minimum=3)
     batching: Literal["dynamic", "fixed"] = option(
         "dynamic",
-        "dynamic builds subsets by retrieval; fixed takes the images as they arrive, with the last placed ones as "
-        "references (the paper's ablation)",
+        "how subsets are built: dynamic chooses images by their similarity; fixed takes the images in order of "
+        "arrival, with the images placed last as references (the paper's ablation)",
         choices=("dynamic", "fixed"),
         advanced=True,
     )
-    batch_size: int = option(5, "most new images in one subset (B_max)", unit="images", minimum=1)
-    references: int = option(5, "references retrieved per image (k_r)", unit="images", minimum=3)
-    subset_references: int = option(8, "most references in one subset (R_k)", unit="images", minimum=3)
+    batch_size: int = option(5, "maximum number of new images in one subset (B_max)", unit="images", minimum=1)
+    references: int = option(5, "number of references retrieved for each image (k_r)", unit="images", minimum=3)
+    subset_references: int = option(8, "maximum number of references in one subset (R_k)", unit="images", minimum=3)
     min_shared_references: int = option(
-        2, "references an image must share with the batch it joins (tau_o)", unit="images", minimum=0, advanced=True
+        2,
+        "minimum number of references that an image shares with the batch that it joins (tau_o)",
+        unit="images",
+        minimum=0,
+        advanced=True,
     )
     min_similarity: float = option(
         0.0,
-        "similarity to the batch that an image must reach to join it (tau_s)",
+        "minimum similarity between an image and the batch that it joins (tau_s)",
         minimum=-1.0,
         maximum=1.0,
         advanced=True,
     )
     lookahead: int = option(
         40,
-        "waiting images among which a batch may be filled; 1 keeps the strict arrival order",
+        "number of waiting images from which a batch is chosen; 1 keeps the order of arrival",
         unit="images",
         minimum=1,
         advanced=True,
     )
-    gps_candidates: bool = option(
-        True, "let GPS positions propose reference candidates (they never decide)", advanced=True
-    )
+    gps_candidates: bool = option(True, "use GPS positions to propose references; the images decide", advanced=True)
     descriptor: Literal["vlad", "efficientnet", "supscene", "megaloc"] = option(
         "vlad",
-        "what images are compared by: vlad needs nothing further, the others are neural networks",
+        "descriptor that images are compared by: vlad needs no download, the others are neural networks",
         choices=("vlad", "efficientnet", "supscene", "megaloc"),
         advanced=True,
     )
     descriptor_weights: str | None = option(
-        None, "weights of supscene or megaloc: a file, a folder, or a hub id with its revision", advanced=True
+        None,
+        "weights of supscene or megaloc: a file, a folder, or a hub id with its revision",
+        advanced=True,
+        example="megaloc.safetensors",
     )
 
 
 @dataclass(frozen=True)
-class BackboneOptions:
+class BackboneOptions(CheckedOptions):
     """The frozen local reconstructor."""
 
-    backbone: str = option("classical", "local reconstructor")
-    working_px: int = option(
-        1000, "longest side to which photographs are reduced for reconstruction", unit="px", minimum=200, maximum=8000
+    backbone: str = option(
+        "classical", "local reconstructor; the command `backbones` lists all of them", example="vggt"
     )
-    features: int = option(2500, "most local features per image", unit="features", minimum=200, advanced=True)
-    dense_px: int = option(500, "longest side of the dense point maps", unit="px", minimum=64, maximum=8000)
+    working_px: int = option(
+        1000,
+        "length of the longer side to which photographs are reduced for the reconstruction",
+        unit="px",
+        minimum=200,
+        maximum=8000,
+    )
+    features: int = option(
+        2500, "maximum number of local features per image", unit="features", minimum=200, advanced=True
+    )
+    dense_px: int = option(
+        500, "length of the longer side of the dense point maps", unit="px", minimum=64, maximum=8000
+    )
     principal_point: bool = option(
         False,
         "estimate the principal point of the cameras too; it is held in the middle of the image otherwise, as COLMAP "
         "does by default",
         advanced=True,
     )
-    threads: int = option(0, "processor cores to use; 0 takes all", unit="cores", minimum=0)
+    threads: int = option(0, "number of processor cores; 0 uses all", unit="cores", minimum=0)
     weights: str | None = option(
-        None, "weights of a neural backbone: a file, a folder, or a hub id with its revision (owner/name@revision)"
+        None,
+        "weights of a neural backbone: a file, a folder, or a hub id with its revision",
+        example="owner/name@revision",
     )
     device: Literal["auto", "cuda", "mps", "cpu"] = option(
         "auto",
-        "where neural networks run; auto takes the GPU where there is one",
+        "device that neural networks run on; auto uses the GPU if there is one",
         choices=("auto", "cuda", "mps", "cpu"),
     )
     max_gpu_memory_gib: float | None = option(
-        None, "most GPU memory a neural backbone may take; default: all of it", unit="GiB", minimum=0.5, advanced=True
+        None,
+        "maximum GPU memory of a neural backbone; default: all of it",
+        unit="GiB",
+        minimum=0.5,
+        advanced=True,
+        example="6",
     )
 
 
 @dataclass(frozen=True)
-class RegistrationOptions:
+class RegistrationOptions(CheckedOptions):
     """Alignment, validation, rejection and retry (paper Sec. III-D and III-E)."""
 
-    min_references: int = option(3, "fewest references that must agree", unit="images", minimum=1, advanced=True)
+    min_references: int = option(
+        3, "minimum number of references that must agree", unit="images", minimum=1, advanced=True
+    )
     reference_points: int = option(
-        2000, "compact reference points kept per image (P_i)", unit="points", minimum=50, advanced=True
+        2000, "number of compact reference points per image (P_i)", unit="points", minimum=50, advanced=True
     )
     alpha: float = option(
-        50.0, "largest reference shift in scene spacings (tau_t = alpha * l_scene)", minimum=1.0, advanced=True
+        50.0, "maximum shift of a reference, in scene spacings (tau_t = alpha * l_scene)", minimum=1.0, advanced=True
     )
     max_rotation_deg: float = option(
-        10.0, "largest rotation of a reference camera against the map", unit="deg", minimum=0.1, advanced=True
+        10.0, "maximum rotation of a reference camera against the map", unit="deg", minimum=0.1, advanced=True
     )
     max_scale_ratio: float = option(
-        2.0, "largest factor by which a subset's scale may differ from the expected one", minimum=1.01, advanced=True
+        2.0, "maximum factor between the scale of a subset and the expected scale", minimum=1.01, advanced=True
     )
     validation: bool = option(
-        True, "check every subset before it may touch the map, drop bad references, retry (V&R)", advanced=True
+        True, "check every subset before it enters the map, drop bad references and try again (V&R)", advanced=True
     )
     reference_gate: float = option(
         6.0,
-        "a reference is also bad when it is shifted by so many medians of the references' shifts; 0 switches it off",
+        "maximum shift of a reference, as a multiple of the median shift of all references; 0 disables the test",
         minimum=0.0,
         advanced=True,
     )
-    validate_queries: bool = option(True, "check new images against the map, not only references", advanced=True)
-    gps_check: bool = option(
-        True, "ask for a second reconstruction of an image that lands far from its GPS position", advanced=True
+    validate_queries: bool = option(
+        True, "check the new images against the map too, not only the references", advanced=True
     )
-    max_retries: int = option(3, "how often a rejected image is tried again", unit="times", minimum=0, advanced=True)
+    gps_check: bool = option(
+        True, "require a second reconstruction of an image that is placed far from its GPS position", advanced=True
+    )
+    max_retries: int = option(
+        3, "maximum number of times that a rejected image is tried again", unit="times", minimum=0, advanced=True
+    )
 
 
 @dataclass(frozen=True)
-class PoseGraphOptions:
+class PoseGraphOptions(CheckedOptions):
     """Drift removal (paper Sec. III-F)."""
 
     pose_graph: Literal["sim3", "se3", "none"] = option(
         "sim3",
-        "sim3 moves submaps and frames with their points, se3 is the paper's frame graph, none switches it off",
+        "sim3 moves submaps and frames together with their points; se3 is the paper's graph of frames; none disables "
+        "it",
         choices=("sim3", "se3", "none"),
         advanced=True,
     )
     gps_priors: bool = option(
-        True, "let GPS positions keep a large map from bending, as far as they are accurate (sim3 only)", advanced=True
+        True,
+        "use GPS positions, weighted by their accuracy, against the bending of a large map (requires sim3)",
+        advanced=True,
     )
     refine: bool = option(
         True,
-        "adjust all cameras and their intrinsics together at the end, where the local reconstructor matches features",
+        "adjust all cameras and their intrinsics together at the end (requires a local reconstructor that matches "
+        "features)",
         advanced=True,
     )
 
 
 @dataclass(frozen=True)
-class GeoreferenceOptions:
+class GeoreferenceOptions(CheckedOptions):
     """From the map to the Earth."""
 
-    crs: str | None = option(None, "projected target CRS, e.g. EPSG:32633; default: UTM zone of the median position")
+    crs: str | None = option(
+        None, "projected CRS of the result; default: UTM zone of the median position", example="EPSG:32633"
+    )
     vertical: Literal["auto", "ellipsoidal", "egm96", "egm2008"] = option(
         "auto",
-        "what the photographs' heights refer to; auto decides from the tags and says so",
+        "reference of the photographs' heights; auto uses what the tags state",
         choices=("auto", "ellipsoidal", "egm96", "egm2008"),
     )
     positions: str | None = option(
         None,
-        "position file (geo.txt: a CRS, then name x y z per line, perhaps yaw pitch roll in degrees, pitch 0 looks "
-        "down); replaces the positions in the tags",
+        "file of camera positions, which replace those in the tags: the first line names a CRS, each further line has "
+        "name, x, y, z and, if known, yaw, pitch, roll in degrees (pitch 0 looks down)",
+        example="geo.txt",
     )
-    local: bool = option(False, "write local coordinates without a CRS, in metres where positions tell the scale")
-    gps_sigma_h_m: float = option(3.0, "horizontal accuracy of positions without their own", unit="m", minimum=0.001)
-    gps_sigma_v_m: float = option(5.0, "vertical accuracy of positions without their own", unit="m", minimum=0.001)
+    local: bool = option(
+        False,
+        "write local coordinates without a CRS; the unit is the metre if positions or the local reconstructor give the "
+        "scale",
+    )
+    gps_sigma_h_m: float = option(
+        3.0, "standard deviation of horizontal positions that state none", unit="m", minimum=0.001
+    )
+    gps_sigma_v_m: float = option(5.0, "standard deviation of heights that state none", unit="m", minimum=0.001)
 
 
 @dataclass(frozen=True)
-class ExportOptions:
+class ExportOptions(CheckedOptions):
     """The files in the output folder."""
 
-    cloud: bool = option(True, "write the point cloud; off leaves cameras, footprints, COLMAP model and report")
+    cloud: bool = option(
+        True, "write the point cloud; without it, cameras, footprints, COLMAP model and report are written"
+    )
     format: Literal["laz", "las"] = option("laz", "point cloud format", choices=("laz", "las"))
     spacing_m: float | None = option(
         None,
-        "voxel size of the fused cloud; default: the ground sampling distance of the point maps",
+        "voxel size of the cloud; default: the ground sampling distance of the point maps",
+        example="0.1",
         unit="m",
         minimum=0.0001,
     )
-    min_confidence: float = option(0.5, "least confidence of an exported point", minimum=0.0, maximum=1.0)
-    stray_filter: bool = option(True, "drop isolated points")
+    min_confidence: float = option(0.5, "minimum confidence of a point of the cloud", minimum=0.0, maximum=1.0)
+    stray_filter: bool = option(True, "remove isolated points")
     boundary: str | None = option(
-        None, "GeoJSON file of polygons (WGS 84 longitude, latitude): points outside them are left out of the cloud"
+        None,
+        "GeoJSON file of polygons in longitude and latitude (WGS 84); the cloud keeps the points inside any of them",
+        example="field.geojson",
     )
 
 
@@ -233,10 +276,29 @@ class Options:
     pose_graph: PoseGraphOptions = field(default_factory=PoseGraphOptions)
     georeference: GeoreferenceOptions = field(default_factory=GeoreferenceOptions)
     export: ExportOptions = field(default_factory=ExportOptions)
+    named: frozenset[str] | None = field(default=None, compare=False, repr=False)  # what the user set, if known
+
+    def __post_init__(self) -> None:
+        """Refuse options that have no effect together; raises `OptionError`."""
+        flat = self.to_flat()
+        for first in CONTRADICTIONS:
+            if first.holds(flat):
+                raise OptionError(first.told)
+
+    def to_named(self) -> dict[str, Any]:
+        """Return `{name: value}` of what the user set and of the preset; what differs from the defaults if unknown."""
+        flat = self.to_flat()
+        if self.named is not None:
+            return {name: value for name, value in flat.items() if name in self.named}
+        defaults = DEFAULT_VALUES | {"preset": "default"} | (PAPER_VALUES if self.preset == "paper" else {})
+        return {"preset": self.preset} | {name: value for name, value in flat.items() if value != defaults[name]}
 
     @classmethod
     def from_flat(cls, values: Mapping[str, Any]) -> Options:
-        """Build options from `{name: value}`; raises `OptionError` for unknown names and bad values."""
+        """Build options from `{name: value}`; raises `OptionError` for unknown names, bad values and contradictions.
+
+        What `values` names wins over the preset, also where it equals the default.
+        """
         remaining = dict(values)
         preset = remaining.pop("preset", "default")
         if preset not in get_args(Preset):
@@ -246,14 +308,11 @@ class Options:
         slices: dict[str, Any] = {}
         for slice_name, slice_class in slice_classes().items():
             names = [f.name for f in dataclasses.fields(slice_class)]
-            chosen = {name: base.pop(name) for name in names if name in base}
-            for name, value in chosen.items():
-                _check(slice_class, name, value)
-            slices[slice_name] = slice_class(**chosen)
+            slices[slice_name] = slice_class(**{name: base.pop(name) for name in names if name in base})
         if base:
             known = ", ".join(sorted(f.name for _, f in iterate_options()))
             raise OptionError(f"unknown option {', '.join(sorted(base))}; known options: {known}")
-        return cls(preset=preset, **slices)
+        return cls(preset=preset, **slices, named=frozenset(values))
 
     def to_flat(self) -> dict[str, Any]:
         """Return `{name: value}` of all options, the inverse of `from_flat`."""
@@ -298,31 +357,57 @@ def iterate_options() -> Iterator[tuple[str, dataclasses.Field[Any]]]:
             yield slice_name, item
 
 
-def check(options_slice: Any) -> None:
-    """Check every field of an option slice against its type and bounds; raises `OptionError`."""
-    for item in dataclasses.fields(options_slice):
-        _check(type(options_slice), item.name, getattr(options_slice, item.name))
+@dataclass(frozen=True)
+class Contradiction:
+    """Two options of which the first has no effect while the second has a certain value."""
+
+    name: str
+    other: str
+    other_values: tuple[Any, ...]
+    told: str
+
+    def holds(self, flat: Mapping[str, Any]) -> bool:
+        """Return whether the values `{name: value}` contradict each other."""
+        return flat[self.name] != DEFAULT_VALUES[self.name] and flat[self.other] in self.other_values
 
 
-def _check(slice_class: type, name: str, value: Any) -> None:
-    item = next(f for f in dataclasses.fields(slice_class) if f.name == name)
-    hint = get_type_hints(slice_class)[name]
-    allowed = get_args(hint) or (hint,)
-    if value is None:
-        if type(None) not in allowed:
-            raise OptionError(f"{name}: a value is needed")
-        return
-    if item.metadata["choices"]:
-        if value not in item.metadata["choices"]:
-            raise OptionError(f"{name}: {value!r} is not one of {', '.join(item.metadata['choices'])}")
-        return
-    numeric_float = float in allowed and isinstance(value, int | float) and not isinstance(value, bool)
-    exact = any(isinstance(a, type) and type(value) is a for a in allowed)
-    if not (numeric_float or exact):
-        raise OptionError(f"{name}: {value!r} is not a {' or '.join(getattr(a, '__name__', str(a)) for a in allowed)}")
-    low, high = item.metadata["minimum"], item.metadata["maximum"]
-    unit = f" {item.metadata['unit']}" if item.metadata["unit"] else ""
-    if low is not None and not value >= low:
-        raise OptionError(f"{name}: {value} is below the least allowed value {low}{unit}")
-    if high is not None and not value <= high:
-        raise OptionError(f"{name}: {value} is above the greatest allowed value {high}{unit}")
+DEFAULT_VALUES: dict[str, Any] = {item.name: item.default for _, item in iterate_options()}
+
+CONTRADICTIONS = (
+    Contradiction("crs", "local", (True,), "crs: --local writes coordinates without a CRS; use only one of the two"),
+    Contradiction(
+        "boundary", "local", (True,), "boundary: --local has no place on the Earth to clip at; use only one of the two"
+    ),
+    Contradiction(
+        "weights",
+        "backbone",
+        ("classical",),
+        "weights: the backbone classical has no weights; name a neural one with --backbone",
+    ),
+    Contradiction(
+        "max_gpu_memory_gib",
+        "backbone",
+        ("classical",),
+        "max_gpu_memory_gib: the backbone classical uses no GPU; name a neural one with --backbone",
+    ),
+    Contradiction(
+        "descriptor_weights",
+        "descriptor",
+        ("vlad", "efficientnet"),
+        "descriptor_weights: this descriptor has no weights of its own; choose supscene or megaloc with --descriptor",
+    ),
+    *(
+        Contradiction(name, "cloud", (False,), f"{name}: --no-cloud writes no cloud; use only one of the two")
+        for name in ("spacing_m", "min_confidence", "boundary", "stray_filter")
+    ),
+)
+
+
+def over_earlier(earlier: Mapping[str, Any], named: Mapping[str, Any]) -> dict[str, Any]:
+    """Return earlier values overridden by named ones; an earlier value that contradicts a named one is left out."""
+    kept = dict(earlier)
+    flat = DEFAULT_VALUES | kept | dict(named)
+    for contradiction in CONTRADICTIONS:
+        if contradiction.holds(flat):
+            kept.pop(contradiction.other if contradiction.name in named else contradiction.name, None)
+    return kept | dict(named)

@@ -86,8 +86,8 @@ class Job:
         return [*words, "--json", "--", *self.arguments]
 
     def write(self, path: Path) -> None:
-        """Write the job as JSON, UTF-8."""
-        path.write_text(json.dumps(asdict(self), ensure_ascii=False, indent=1), encoding="utf-8")
+        """Write the job as JSON; ASCII only, so that a file name that is no text comes through as it is."""
+        path.write_text(json.dumps(asdict(self), indent=1), encoding="ascii")
 
     @classmethod
     def read(cls, path: Path) -> Job:

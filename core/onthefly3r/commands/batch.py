@@ -21,7 +21,7 @@ from typing import Any, Literal
 from ..errors import Cancelled, InputError, OptionError, ReconstructionError
 from ..files.atomic import write_text
 from ..intake.folder import find_photographs
-from ..options import Options
+from ..options import Options, over_earlier
 from ..protocol import Event, Job, Progress, ProgressCallback
 
 Status = Literal["done", "failed", "skipped"]
@@ -205,10 +205,8 @@ def _reconstruct(
     follow: Callable[[Event], None],
     cancel: Callable[[], bool] | None,
 ) -> FlightResult:
-    # Only what differs from the defaults: a row's preset then still decides about the rest.
-    defaults = Options().to_flat()
-    named = {name: value for name, value in options.to_flat().items() if value != defaults[name]}
-    job = Job("run", (str(flight.photos), str(folder)), {**named, **flight.options})
+    # Only what was named: a row's preset then still decides about the rest.
+    job = Job("run", (str(flight.photos), str(folder)), over_earlier(options.to_named(), flight.options))
     began = time.monotonic()
     returncode, error = _run(job, follow, cancel)
     if returncode == 0:

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .. import __version__
-from ..errors import InputError
+from ..errors import InputError, ReconstructionError
 from ..evaluate.comparison import CloudAlign
 from ..evaluate.trajectory_errors import Align
-from ..options import check as check_options
+from ..options import over_earlier
 from ..protocol import Job
 from ..simulate.flight import SurveyOptions
 from .console import columns, session, use_utf8
@@ -101,6 +101,9 @@ def batch(
         )
         data = {"table": str(out / "flights.csv"), "flights": [asdict(row) for row in rows]}
         here.reporter.result(data, columns({row.flight: f"{row.status} {row.message}".strip() for row in rows}))
+        failed = [row.flight for row in rows if row.status == "failed"]
+        if failed:
+            raise ReconstructionError(f"{len(failed)} of {len(rows)} flights failed: {', '.join(failed)}")
 
 
 @app.command()
@@ -146,7 +149,7 @@ def export(
         _require_folder(result, "RESULT")
         from ..run.session import earlier_options, export_again
 
-        options = run_options({**earlier_options(result), **given(values)})
+        options = run_options(over_earlier(earlier_options(result), given(values)))
         again = export_again(result, out, options, here.progress)
         here.reporter.result(_result_data(again), columns(_result_summary(again)))
 
@@ -206,7 +209,6 @@ def simulate(out: Out, json: JsonLines = False, **values: Any) -> None:
     """Render a made-up survey: photographs with tags in OUT/photos, the truth in OUT/truth."""
     with session(json_lines=json, out=out) as here:
         options = SurveyOptions(**given(values))
-        check_options(options)
         from ..simulate import simulate_survey
 
         survey = simulate_survey(out, options, here.progress)

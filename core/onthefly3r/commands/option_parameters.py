@@ -61,6 +61,8 @@ def describe(item: dataclasses.Field[Any]) -> str:
         facts.append(f"default: {item.default}{unit}")
     elif unit:
         facts.append(f"in{unit}")
+    if item.metadata["example"]:
+        facts.append(f"example: {item.metadata['example']}{unit}")
     if low is not None and high is not None:
         facts.append(f"{low} to {high}")
     elif low is not None:

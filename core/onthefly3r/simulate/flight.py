@@ -14,7 +14,7 @@ from ..geometry.camera import Camera
 from ..geometry.frames import enu_from_cam_rotation, gimbal_angles_deg
 from ..geometry.geodesy import EnuFrame, undulation_m
 from ..geometry.transforms import Rigid3, rotation_exp
-from ..options import check, option
+from ..option_fields import CheckedOptions, option
 from ..records import Attitude, GpsFix, VerticalReference
 from .scene import Scene, make_scene
 
@@ -31,7 +31,7 @@ GAP_IMAGES = 3  # images missing in a row
 
 
 @dataclass(frozen=True)
-class SurveyOptions:
+class SurveyOptions(CheckedOptions):
     """A survey to be simulated; the defaults are the demo survey."""
 
     images: int = option(40, "photographs", unit="images", minimum=3, maximum=20000)
@@ -85,7 +85,6 @@ class Survey:
 
 def plan_survey(options: SurveyOptions, origin: EnuFrame | None = None) -> Survey:
     """Return the flight over a landscape that is made to fit it; raises `OptionError` for an impossible plan."""
-    check(options)
     origin = origin or DEFAULT_ORIGIN
     rng = np.random.default_rng((options.seed, 1))
     camera = _camera(options)

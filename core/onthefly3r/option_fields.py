@@ -1,0 +1,73 @@
+"""How one option is declared: its default, help, unit, bounds and example, and the check of its values.
+
+Standard library only: QGIS imports this module in its own process.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import field
+from typing import Any, get_args, get_type_hints
+
+from .errors import OptionError
+
+
+def option(
+    default: Any,
+    help: str,
+    *,
+    unit: str = "",
+    choices: tuple[str, ...] = (),
+    minimum: float | None = None,
+    maximum: float | None = None,
+    advanced: bool = False,
+    example: str = "",
+) -> Any:
+    """Declare one option: help, unit, bounds and example appear in every user interface, and values are checked."""
+    metadata = {
+        "example": example,
+        "help": help,
+        "unit": unit,
+        "choices": choices,
+        "minimum": minimum,
+        "maximum": maximum,
+        "advanced": advanced,
+    }
+    return field(default=default, metadata=metadata)
+
+
+class CheckedOptions:
+    """Base of option slices: an object with a wrong value cannot be made, whoever makes it."""
+
+    def __post_init__(self) -> None:
+        """Check every field against its type and bounds; raises `OptionError`."""
+        for item in dataclasses.fields(self):  # type: ignore[arg-type]
+            if "help" in item.metadata:
+                _check(type(self), item, getattr(self, item.name))
+
+
+def _check(slice_class: type, item: dataclasses.Field[Any], value: Any) -> None:
+    name = item.name
+    hint = get_type_hints(slice_class)[name]
+    allowed = get_args(hint) or (hint,)
+    if value is None:
+        if type(None) not in allowed:
+            raise OptionError(f"{name}: this option requires a value")
+        return
+    if item.metadata["choices"]:
+        if value not in item.metadata["choices"]:
+            raise OptionError(f"{name}: {value!r} is not one of {', '.join(item.metadata['choices'])}")
+        return
+    numeric_float = float in allowed and isinstance(value, int | float) and not isinstance(value, bool)
+    exact = any(isinstance(a, type) and type(value) is a for a in allowed)
+    if not (numeric_float or exact):
+        raise OptionError(f"{name}: {value!r} is not a {' or '.join(getattr(a, '__name__', str(a)) for a in allowed)}")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise OptionError(f"{name}: {value} is not a finite number")
+    low, high = item.metadata["minimum"], item.metadata["maximum"]
+    unit = f" {item.metadata['unit']}" if item.metadata["unit"] else ""
+    if low is not None and not value >= low:
+        raise OptionError(f"{name}: {value} is below the minimum of {low}{unit}")
+    if high is not None and not value <= high:
+        raise OptionError(f"{name}: {value} is above the maximum of {high}{unit}")
