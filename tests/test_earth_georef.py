@@ -191,6 +191,12 @@ def test_line_needs_gimbal_angles() -> None:
     assert scale_error(found, s) < 0.02
 
 
+def test_a_weaving_strip_with_precise_positions_is_no_line() -> None:
+    s = survey(2, strips=1, images=20, wander_m=5.0)
+    found = georeference(s.map_from_cam, s.shots(s.noise(0.02), sigma_m=0.02), GeoreferenceOptions())
+    assert tilt_deg(found, s) < 0.5
+
+
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_positions(count: int) -> None:
     s = survey(0)

@@ -75,3 +75,9 @@ def test_sensor_table_is_sane() -> None:
     assert sensor_size_mm("", "ZenmuseP1") == (35.9, 24.0)
     assert sensor_size_mm("DJI", "") is None
     assert sensor_size_mm("Nobody", "Nothing") is None
+
+
+def test_digital_zoom_lengthens_the_focal_length() -> None:
+    plain = prior(PHANTOM)[0]
+    assert prior({**PHANTOM, "DigitalZoomRatio": 2.0})[0] == pytest.approx(2.0 * plain)
+    assert prior({**PHANTOM, "DigitalZoomRatio": 0.0})[0] == plain  # EXIF: 0 means that no zoom was used

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from onthefly3r.geometry.camera import Camera
 from onthefly3r.geometry.frames import enu_from_cam_rotation
 from onthefly3r.geometry.transforms import Rigid3
-from onthefly3r.products.footprints import MAX_REACH, footprint, with_overlap, write_footprints
+from onthefly3r.products.footprints import footprint, with_overlap, write_footprints
 from onthefly3r.records import PlacedCamera
 
 CAMERA = Camera(1600, 900, 800.0, 800.0, 800.0, 450.0)
@@ -38,7 +38,15 @@ def test_nadir_covers_width_times_height(yaw_deg: float) -> None:
 def test_oblique_view_ends_before_the_horizon() -> None:
     found = footprint(placed("a.jpg", 0.0, 0.0, pitch_deg=-10.0), ground_z_m=100.0)
     assert found is not None
-    assert np.linalg.norm(found.outline, axis=1).max() == pytest.approx(40.0 * MAX_REACH)
+    assert np.linalg.norm(found.outline, axis=1).max() == pytest.approx(160.0)  # four flying heights
+
+
+def test_ground_sampling_distance_of_an_oblique_view_is_that_of_the_slanted_ray() -> None:
+    found = footprint(placed("a.jpg", 0.0, 0.0, pitch_deg=-50.0), ground_z_m=100.0)
+    assert found is not None
+    slant_m = float(np.hypot(40.0, np.linalg.norm(found.centre)))
+    assert slant_m > 1.3 * 40.0
+    assert found.gsd_m == pytest.approx(slant_m / 800.0)
 
 
 @pytest.mark.parametrize(("pitch_deg", "ground_z_m"), [(-90.0, 150.0), (80.0, 100.0)])
