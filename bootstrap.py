@@ -5,6 +5,8 @@
     python3 bootstrap.py demo [OUT]                   render a small survey and reconstruct it
     python3 bootstrap.py run PHOTOS OUT [options...]  reconstruct a folder of photographs
     python3 bootstrap.py test [pytest arguments...]   lint, types and tests, those of QGIS too where it is installed
+    python3 bootstrap.py test --quick                 lint, types and the fast tests, with the base installation only
+    python3 bootstrap.py lint                         lint and types
     python3 bootstrap.py package                      write the zip of the QGIS plugin
 
 Standard library only, Linux, macOS and Windows, no administrator rights. Other programs may import this
@@ -25,7 +27,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,7 @@ OLDEST_PYTHON = (3, 10)
 QGIS_PYTHON = "ONTHEFLY3R_QGIS_PYTHON"  # variable that names an interpreter with QGIS, for the tests
 QGIS_PACKAGES = ("qgis", "python3-qgis", "qgis-providers", "python3-pytest", "xvfb")
 TEST_EXTRAS = ("cloud", "neural", "test")
+QUICK_EXTRAS = ("test",)
 
 # Room that an installation needs while it is under way, in MiB: wheels, their unpacked files and pip's copies.
 BASE_NEED_MIB = 1200
@@ -318,33 +321,54 @@ def run(environment: Path, rest: Sequence[str]) -> int:
     return _call([create_environment(environment), "-m", "onthefly3r", "run", *rest])
 
 
-def test(environment: Path, rest: Sequence[str]) -> int:
-    """Run every check to its end, and return 0 only when all passed."""
-    python = create_environment(environment, TEST_EXTRAS, constraints=TEST_CONSTRAINTS, alone=TEST_MODELS)
-    for sentence in missing_system_libraries(python):
-        say(f"Tests that need it will be skipped: {sentence}")
-    checks: dict[str, list[str | Path]] = {
+def lint(environment: Path) -> int:
+    """Check style and types, and return 0 only when both are clean."""
+    return 0 if all(_checked(_lint_checks(create_environment(environment, QUICK_EXTRAS))).values()) else 1
+
+
+def _lint_checks(python: Path) -> dict[str, list[str | Path]]:
+    return {
         "ruff check": [python, "-m", "ruff", "check", ROOT],
         "ruff format": [python, "-m", "ruff", "format", "--check", ROOT],
         "mypy": [python, "-m", "mypy", "--config-file", ROOT / "pyproject.toml"],
-        "pytest": [python, "-m", "pytest", "--rootdir", ROOT, "-c", ROOT / "pyproject.toml", *rest],
     }
-    outcome = {}
+
+
+def _checked(checks: Mapping[str, Sequence[str | Path]]) -> dict[str, bool]:
+    """Run each check to its end; return whether it passed, by name."""
+    passed = {}
     for name, command in checks.items():
         say(f"== {name}")
-        outcome[name] = _call(command)
-    left_out = "pytest was given arguments" if rest else ""
+        passed[name] = _call(command) == 0
+    return passed
+
+
+def test(environment: Path, rest: Sequence[str]) -> int:
+    """Run every check to its end, and return 0 only when all passed."""
+    quick = "--quick" in rest
+    rest = [word for word in rest if word != "--quick"]
+    if quick:
+        python = create_environment(environment, QUICK_EXTRAS)
+        rest = ["-m", "not slow and not photographs", *rest]
+    else:
+        python = create_environment(environment, TEST_EXTRAS, constraints=TEST_CONSTRAINTS, alone=TEST_MODELS)
+    for sentence in missing_system_libraries(python):
+        say(f"Tests that need it will be skipped: {sentence}")
+    pytest = [python, "-m", "pytest", "--rootdir", ROOT, "-c", ROOT / "pyproject.toml", *rest]
+    passed = _checked({**_lint_checks(python), "pytest": pytest})
+    left_out = "the quick run has none" if quick else "pytest was given arguments" if rest else ""
     if not left_out:
         qgis_python, left_out = find_qgis()
     if not left_out:
         say("== tests of QGIS")
         tests = ROOT / "tests" / "qgis"
         command = [qgis_python, "-m", "pytest", "-c", tests / "pytest.ini", "--rootdir", tests, tests]
-        outcome["tests of QGIS"] = _call(command, ONTHEFLY3R_PYTHON=str(python), QT_QPA_PLATFORM="offscreen")
-    failed = [name for name, status in outcome.items() if status != 0]
+        status = _call(command, ONTHEFLY3R_PYTHON=str(python), QT_QPA_PLATFORM="offscreen")
+        passed["tests of QGIS"] = status == 0
+    failed = [name for name, good in passed.items() if not good]
     if left_out:
         say(f"Left out: tests of QGIS ({left_out})")
-    say(f"Failed: {', '.join(failed)}" if failed else "All checks passed: " + ", ".join(outcome))
+    say(f"Failed: {', '.join(failed)}" if failed else "All checks passed: " + ", ".join(passed))
     return 1 if failed else 0
 
 
@@ -358,7 +382,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="bootstrap.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("verb", choices=("setup", "demo", "run", "test", "package"))
+    parser.add_argument("verb", choices=("setup", "demo", "run", "test", "lint", "package"))
     parser.add_argument("rest", nargs=argparse.REMAINDER, help="what the verb takes")
     chosen = parser.parse_args(arguments)
     if sys.version_info < OLDEST_PYTHON:
@@ -376,6 +400,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return demo(environment, out, chosen.rest)
         if chosen.verb == "run":
             return run(environment, chosen.rest)
+        if chosen.verb == "lint":
+            return lint(environment)
         return test(environment, chosen.rest)
     except SetupError as error:
         say(str(error))

@@ -256,6 +256,21 @@ def test_every_check_runs_and_one_failure_fails(
     assert capsys.readouterr().out.strip().endswith("Failed: mypy")
 
 
+def test_quick_run_leaves_out_what_is_slow_and_takes_the_base_installation(
+    bootstrap: ModuleType, calls: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(bootstrap, "create_environment", lambda *given, **named: asked.append(given) or Path("python"))
+    bootstrap.main(["test", "--quick", "-x"])
+    assert calls[-1][-3:] == ["-m", "not slow and not photographs", "-x"]
+    assert asked[0][1] == ("test",)
+
+
+def test_lint_is_a_part_of_it(bootstrap: ModuleType, calls: list[list[str]]) -> None:
+    assert bootstrap.main(["lint"]) == 1  # mypy fails here
+    assert [command[2] for command in calls] == ["ruff", "ruff", "mypy"]
+
+
 def test_qgis_is_tested_where_it_is_found(
     bootstrap: ModuleType, calls: list[list[str]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
