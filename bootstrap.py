@@ -354,7 +354,7 @@ def test(environment: Path, rest: Sequence[str]) -> int:
         python = create_environment(environment, TEST_EXTRAS, constraints=TEST_CONSTRAINTS, alone=TEST_MODELS)
     for sentence in missing_system_libraries(python):
         say(f"Tests that need it will be skipped: {sentence}")
-    pytest = [python, "-m", "pytest", "--rootdir", ROOT, "-c", ROOT / "pyproject.toml", *rest]
+    pytest: list[str | Path] = [python, "-m", "pytest", "--rootdir", ROOT, "-c", ROOT / "pyproject.toml", *rest]
     passed = _checked({**_lint_checks(python), "pytest": pytest})
     left_out = "the quick run has none" if quick else "pytest was given arguments" if rest else ""
     if not left_out:
@@ -362,7 +362,7 @@ def test(environment: Path, rest: Sequence[str]) -> int:
     if not left_out:
         say("== tests of QGIS")
         tests = ROOT / "tests" / "qgis"
-        command = [qgis_python, "-m", "pytest", "-c", tests / "pytest.ini", "--rootdir", tests, tests]
+        command: list[str | Path] = [qgis_python, "-m", "pytest", "-c", tests / "pytest.ini", "--rootdir", tests, tests]
         status = _call(command, ONTHEFLY3R_PYTHON=str(python), QT_QPA_PLATFORM="offscreen")
         passed["tests of QGIS"] = status == 0
     failed = [name for name, good in passed.items() if not good]
