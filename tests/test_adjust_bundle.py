@@ -129,7 +129,7 @@ def test_stated_precision_of_the_focal_length_is_its_scatter() -> None:
         solved, _ = bundle.minimised(state_of(truth), np.sqrt(0.5))
         normal = bundle.normal_equations(solved, np.sqrt(0.5))
         found.append(solved.intrinsics[0, 0])
-        stated.append(np.sqrt(normal.intrinsics_covariance()[0, 0]))
+        stated.append(np.sqrt(normal.shared_covariance()[0, 0]))
     # The first noise is common to all seeds; half of the variance differs. A Huber kernel costs about a tenth.
     assert np.std(found) * np.sqrt(2.0) == pytest.approx(np.mean(stated), rel=0.5)
 

@@ -13,24 +13,39 @@ from onthefly3r import Options, reconstruct
 from onthefly3r.errors import GeoreferenceError
 from onthefly3r.evaluate.comparison import EvaluationReport, evaluate
 from onthefly3r.evaluate.readers import read_poses, read_trajectory_csv
+from onthefly3r.geometry.umeyama import weighted_similarity
 from onthefly3r.run.session import export_again
 
 pytestmark = pytest.mark.photographs
 
-# Required against the reference: share of its images, error in % of the flying height, error of the angles.
+# Required against the reference: share of its images, error in % of the flying height, error of the angles. Where the
+# photographs tell the principal point, the reference has it free too: held in the middle it is 2.2 % off on caliterra.
 COVERAGE, ATE_PERCENT, ARE_DEG = 0.95, 0.7, 0.5
+WITH_FREE_POINT = {"caliterra": 0.10, "lewis": 0.10, "boruszyn": 0.20}  # set -> largest error in %
 CAMERAS_ONLY = {"dense_px": 100, "cloud": False}
 
 
 def run(sets: Path, name: str, out: Path, **options: Any) -> EvaluationReport:
     reconstruct(sets / name / "photos", out, Options.from_flat(options))
-    return evaluate(out, sets / name / "reference")
+    return evaluate(out, sets / name / ("reference_pp/free" if name in WITH_FREE_POINT else "reference"))
 
 
-def require(report: EvaluationReport) -> None:
-    assert report.poses is not None and report.scene_depth is not None
+def flying_height(folder: Path) -> float:
+    """The median scene depth of the reference, in the unit of the model that a result is compared with."""
+    depth = json.loads((folder / "reference" / "summary.json").read_text(encoding="utf-8"))["median_scene_depth"]
+    if folder.name not in WITH_FREE_POINT:
+        return float(depth)
+    models = [read_poses(folder / model) for model in ("reference", "reference_pp/free")]
+    centres = [dict(zip(model.names, model.centres, strict=True)) for model in models]
+    common = sorted(set(centres[0]) & set(centres[1]))
+    source, target = (np.array([of[name] for name in common]) for of in centres)
+    return float(depth * weighted_similarity(source, target, np.ones(len(common))).scale)
+
+
+def require(sets: Path, name: str, report: EvaluationReport) -> None:
+    assert report.poses is not None
     assert report.poses.coverage >= COVERAGE
-    assert 100.0 * report.poses.ate / report.scene_depth <= ATE_PERCENT
+    assert 100.0 * report.poses.ate / flying_height(sets / name) <= WITH_FREE_POINT.get(name, ATE_PERCENT)
     assert report.poses.are_deg <= ARE_DEG
 
 
@@ -38,7 +53,7 @@ def test_brighton_beach(photograph_sets: Path, tmp_path: Path) -> None:
     """The ground lies where the drone's barometer says: 158.5 m is its height less that above the take-off."""
     import laspy
 
-    require(run(photograph_sets, "brighton_beach", tmp_path))
+    require(photograph_sets, "brighton_beach", run(photograph_sets, "brighton_beach", tmp_path))
     report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
     assert (report["georeference"]["crs"], report["georeference"]["vertical"]) == ("EPSG:32615", "egm96")
     assert report["georeference"]["rmse_h_m"] < 1.0
@@ -49,19 +64,19 @@ def test_brighton_beach(photograph_sets: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["brighton_beach", "caliterra"])
 def test_shuffled_photographs(photograph_sets: Path, tmp_path: Path, name: str) -> None:
-    require(run(photograph_sets, name, tmp_path, shuffle_seed=3, **CAMERAS_ONLY))
+    require(photograph_sets, name, run(photograph_sets, name, tmp_path, shuffle_seed=3, **CAMERAS_ONLY))
 
 
 def test_caliterra_is_level_although_its_heights_drift(photograph_sets: Path, tmp_path: Path) -> None:
     """Its camera axes stay within ten degrees of the nadir on average, where a plain fit tilts them by 45."""
-    require(run(photograph_sets, "caliterra", tmp_path, **CAMERAS_ONLY))
+    require(photograph_sets, "caliterra", run(photograph_sets, "caliterra", tmp_path, **CAMERAS_ONLY))
     axes = read_trajectory_csv(tmp_path / "trajectory.csv").rotations[:, :, 2]
     mean = axes.mean(axis=0)
     assert np.degrees(np.arccos(-mean[2] / np.linalg.norm(mean))) < 10.0
 
 
 def test_sheffield_cross(photograph_sets: Path, tmp_path: Path) -> None:
-    require(run(photograph_sets, "sheffield_cross", tmp_path, **CAMERAS_ONLY))
+    require(photograph_sets, "sheffield_cross", run(photograph_sets, "sheffield_cross", tmp_path, **CAMERAS_ONLY))
 
 
 def test_copr_has_no_positions(photograph_sets: Path, tmp_path: Path) -> None:

@@ -121,10 +121,11 @@ class BackboneOptions(CheckedOptions):
     dense_px: int = option(
         500, "length of the longer side of the dense point maps", unit="px", minimum=64, maximum=8000
     )
-    principal_point: bool = option(
-        False,
-        "estimate the principal point of the cameras too; it is held in the middle of the image otherwise, as COLMAP "
-        "does by default",
+    principal_point: Literal["auto", "free", "held"] = option(
+        "auto",
+        "the principal point of the cameras: auto estimates it where the photographs tell it and holds it in the "
+        "middle of the image where they do not, free always estimates it, held never",
+        choices=("auto", "free", "held"),
         advanced=True,
     )
     threads: int = option(0, "number of processor cores; 0 uses all", unit="cores", minimum=0)

@@ -1,14 +1,15 @@
-"""Bundle adjustment of poses, points and shared intrinsics with priors on the intrinsics, in vectorised numpy.
+"""Bundle adjustment of poses, points and shared intrinsics with priors, in vectorised numpy.
 
 Levenberg-Marquardt with the points eliminated (Triggs et al. 2000, Bundle Adjustment - A Modern Synthesis), sparse, so
-that it serves the first model and the whole map alike. The gauge is left free: the damping takes care of it, and the
-intrinsics do not depend on it.
+that it serves the first model and the whole map alike. What is known apart from the images, positions, the level and
+ground control, enters as `Ties`. Without them the gauge is free: the damping takes care of it, and the intrinsics do
+not depend on it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,14 @@ from ..geometry.arrays import Bool, Float, Int
 from ..geometry.camera import Camera
 from ..geometry.transforms import rotation_exp
 from .intrinsics import PARAMETERS, projection_jacobians, with_intrinsics
+from .normal_equations import LEAST_DAMPING, NormalEquations
+from .ties import Ties
 
 HUBER = 1.5  # in standard deviations of a pixel coordinate
 STUDENT = 4.0  # degrees of freedom of the priors: a lens that is far from usual is believed when the images insist
 MAX_ITERATIONS = 40
 CONVERGED = 1e-4  # relative decrease of the cost that ends the iterations
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e-9, 1e9
+FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e9
 
 
 @dataclass(frozen=True)
@@ -33,62 +36,7 @@ class State:
     centres: Float  # (I, 3) local frame
     points: Float  # (N, 3) local frame
     intrinsics: Float  # (K, 8) PARAMETERS of the free keys
-
-
-@dataclass(frozen=True)
-class NormalEquations:
-    """The normal equations of poses and intrinsics (C, D of them) and points (P), what they share by observation."""
-
-    cc: Any  # (D, D) sparse
-    pp: Float  # (N, 3, 3)
-    pose_point: Float  # (M, 6, 3)
-    intrinsics_point: Float  # (K, N, 8, 3)
-    c: Float  # (D,) negative gradient
-    p: Float  # (N, 3)
-    image: Int  # (M,)
-    point: Int  # (M,)
-
-    def eliminated(self, damping: float) -> tuple[Float, Any, Any]:
-        """Return the root R of pp^-1 = R R^T (N, 3, 3), cp R (D, 3N) and the damped system of C (D, D), sparse."""
-        from scipy import sparse
-
-        trace = np.einsum("nii->n", self.pp)
-        diagonal = damping * np.einsum("nii->ni", self.pp) + (LEAST_DAMPING * trace + (trace == 0.0))[:, None]
-        root = np.swapaxes(np.linalg.inv(np.linalg.cholesky(self.pp + diagonal[:, :, None] * np.eye(3))), 1, 2)
-        n_shared = len(self.intrinsics_point) * len(PARAMETERS)
-        n_images = (len(self.c) - n_shared) // 6
-        order = np.argsort(self.image, kind="stable")
-        starts = np.concatenate([[0], np.cumsum(np.bincount(self.image, minlength=n_images))])
-        blocks = (self.pose_point @ root[self.point])[order], self.point[order], starts
-        poses = sparse.bsr_matrix(blocks, shape=(6 * n_images, 3 * len(self.pp)))
-        shared = np.swapaxes(self.intrinsics_point @ root, 1, 2).reshape(n_shared, 3 * len(self.pp))
-        cp = sparse.vstack([poses.tocsr(), sparse.csr_matrix(shared)], format="csr")
-        damped = self.cc + (damping + LEAST_DAMPING) * sparse.diags(self.cc.diagonal())
-        return root, cp, (damped - cp @ cp.T).tocsc()
-
-    def step(self, damping: float) -> tuple[Float, Float]:
-        """Return the damped step of poses and intrinsics (D,) and of the points (N, 3)."""
-        root, cp, matrix = self.eliminated(damping)
-        p = np.einsum("nji,nj->ni", root, self.p).ravel()
-        dc = self._solved(matrix, self.c - cp @ p)
-        return dc, np.einsum("nij,nj->ni", root, (p - cp.T @ dc).reshape(-1, 3))
-
-    def intrinsics_covariance(self) -> Float:
-        """Return the covariance (8K, 8K) of the free intrinsics, poses and points marginalised."""
-        n_shared = len(self.intrinsics_point) * len(PARAMETERS)
-        wanted = np.eye(len(self.c))[:, len(self.c) - n_shared :]
-        return self._solved(self.eliminated(0.0)[2], wanted)[len(self.c) - n_shared :]
-
-    def _solved(self, matrix: Any, right: Float) -> Float:
-        """Solve the system of C scaled to a unit diagonal of `cc`, where rotations and metres are alike."""
-        from scipy import sparse
-        from scipy.sparse.linalg import splu
-
-        scale = 1.0 / np.sqrt(self.cc.diagonal())
-        scaled = (sparse.diags(scale) @ matrix @ sparse.diags(scale)).tocsc()
-        columns = scale.reshape(-1, *[1] * (right.ndim - 1))
-        solver = splu(scaled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        return np.asarray(columns * solver.solve(columns * right))
+    biases: Float = field(default_factory=lambda: np.zeros(0))  # (B,) those of the ties
 
 
 @dataclass(frozen=True)
@@ -104,7 +52,9 @@ class Bundle:
     cameras: Mapping[str, Camera]  # by key; of a free key only the size is used
     mean: Float  # (K, 8)
     whitening: Float  # (K, 8, 8)
-    adjustable: Bool  # (8,) which of PARAMETERS may change
+    adjustable: Bool  # (8,) or (K, 8) which of PARAMETERS may change
+    ties: Ties | None = None
+    prior_weight: Float | float = 1.0  # (K, 8) of the deviations from the priors
 
     def camera(self, key: str, state: State) -> Camera:
         """Return the camera of a key in this state."""
@@ -124,42 +74,51 @@ class Bundle:
     def noise_px(self, state: State) -> float:
         """Return the standard deviation of a pixel coordinate, from the median residual and the redundancy."""
         squared = np.sum(self.residuals(state) ** 2, axis=1)
+        squared = squared[np.isfinite(squared)]
         unknowns = 3 * len(state.points) + 6 * len(self.keys)
         redundancy = max(1.0 - unknowns / (2.0 * len(squared)), 0.05)
         return float(max(np.sqrt(np.median(squared) / (2.0 * np.log(2.0)) / redundancy), 1e-6))  # Rayleigh's median
 
     def cost(self, state: State, noise_px: float) -> float:
-        """Return half the weighted Huber cost plus the priors'; infinite with a point behind its camera."""
+        """Return half the weighted Huber cost, priors and ties added; infinite with a point behind its camera."""
         ratio = np.linalg.norm(self.residuals(state), axis=1) / noise_px
         if not np.isfinite(ratio).all():
             return np.inf
         huber = np.where(ratio <= HUBER, 0.5 * ratio**2, HUBER * (ratio - 0.5 * HUBER))
-        prior = 0.5 * STUDENT * np.log1p(self.deviation(state) ** 2 / STUDENT)
-        return float(self.weight @ huber + prior.sum())
+        prior = self.prior_weight * 0.5 * STUDENT * np.log1p(self.deviation(state) ** 2 / STUDENT)
+        tied = self.ties.cost(state.rotations, state.centres, state.points, state.biases) if self.ties else 0.0
+        return float(self.weight @ huber + prior.sum() + tied)
 
     def deviation(self, state: State) -> Float:
         """Return the intrinsics minus the prior mean (K, 8), in standard deviations of the priors."""
         return np.asarray(np.einsum("kij,kj->ki", self.whitening, state.intrinsics - self.mean))
 
     def normal_equations(self, state: State, noise_px: float) -> NormalEquations:
-        """Return the normal equations of the reweighted residuals and priors."""
+        """Return the normal equations of the reweighted residuals, priors and ties."""
         residual = self.residuals(state)
         ratio = np.linalg.norm(residual, axis=1) / noise_px
         root = np.sqrt(self.weight * np.minimum(1.0, HUBER / np.maximum(ratio, 1e-12))) / noise_px
         residual = root[:, None] * residual
         by_pose, by_intrinsics, by_point = (root[:, None, None] * jacobian for jacobian in self.jacobians(state))
-        cc, c = self._poses_and_intrinsics(by_pose, by_intrinsics, residual)
-        prior_cc, prior_c = self._priors(state)
+        cc, c = self._poses_and_shared(state, by_pose, by_intrinsics, residual)
         point_t, intrinsics_t = np.swapaxes(by_point, 1, 2), np.swapaxes(by_intrinsics, 1, 2)
         n = len(state.points)
-        shared = [self._by_point(intrinsics_t @ by_point * self._rows(key)[:, None, None], n) for key in self.free]
+        pp = self._by_point(point_t @ by_point, n)
+        p = self._by_point(np.einsum("mki,mk->mi", by_point, residual), n)
+        if self.ties:
+            tied_pp, tied_p = self.ties.points(state.points)
+            pp[self.ties.control], p[self.ties.control] = pp[self.ties.control] + tied_pp, p[self.ties.control] + tied_p
+        shared = np.zeros((c.size - 6 * len(self.keys), n, 3))
+        for k, key in enumerate(self.free):
+            crossed = self._by_point(intrinsics_t @ by_point * self._rows(key)[:, None, None], n)
+            shared[k * len(PARAMETERS) : (k + 1) * len(PARAMETERS)] = np.swapaxes(crossed, 0, 1)
         return NormalEquations(
-            cc=cc + prior_cc,
-            pp=self._by_point(point_t @ by_point, n),
+            cc=cc,
+            pp=pp,
             pose_point=np.swapaxes(by_pose, 1, 2) @ by_point,
-            intrinsics_point=np.array(shared).reshape(-1, n, len(PARAMETERS), 3),
-            c=c + prior_c,
-            p=self._by_point(np.einsum("mki,mk->mi", by_point, residual), n),
+            shared_point=shared,
+            c=c,
+            p=p,
             image=self.image,
             point=self.point,
         )
@@ -171,35 +130,56 @@ class Bundle:
         """
         seen = self._in_camera(state)
         by_seen, by_intrinsics = np.empty((len(seen), 2, 3)), np.zeros((len(seen), 2, len(PARAMETERS)))
+        adjustable = np.broadcast_to(self.adjustable, (len(self.free), len(PARAMETERS)))
         for key in set(self.keys):
             rows = self._rows(key)
             by_seen[rows], derivative = projection_jacobians(self.camera(key, state), seen[rows])
             if key in self.free:
-                by_intrinsics[rows] = derivative * self.adjustable
+                by_intrinsics[rows] = derivative * adjustable[self.free.index(key)]
         by_point = by_seen @ np.swapaxes(state.rotations, 1, 2)[self.image]
         by_rotation = np.cross(by_seen, seen[:, None, :])  # the point moves by seen x w
         return np.concatenate([by_rotation, -by_point], axis=2), by_intrinsics, by_point
 
     def moved(self, state: State, dc: Float, dp: Float) -> State:
-        """Return the state after a step of poses and intrinsics (D,) and points (N, 3)."""
-        poses = dc[: 6 * len(self.keys)].reshape(-1, 6)
+        """Return the state after a step of poses and shared unknowns (D,) and points (N, 3)."""
+        poses, shared = dc[: 6 * len(self.keys)].reshape(-1, 6), dc[6 * len(self.keys) :]
         turned = np.array([r @ rotation_exp(w) for r, w in zip(state.rotations, poses[:, :3], strict=True)])
-        intrinsics = state.intrinsics + dc[6 * len(self.keys) :].reshape(state.intrinsics.shape)
-        return State(turned, state.centres + poses[:, 3:], state.points + dp, intrinsics)
+        intrinsics = state.intrinsics + shared[: state.intrinsics.size].reshape(state.intrinsics.shape)
+        biases = state.biases + shared[state.intrinsics.size :]
+        return State(turned, state.centres + poses[:, 3:], state.points + dp, intrinsics, biases)
 
-    def minimised(self, state: State, noise_px: float) -> tuple[State, int]:
+    def point_step(self, state: State, noise_px: float) -> Float:
+        """Return the step (N, 3) of the points alone, cameras as they are."""
+        residual = self.residuals(state)
+        ratio = np.linalg.norm(residual, axis=1) / noise_px
+        weight = self.weight * np.minimum(1.0, HUBER / np.maximum(np.nan_to_num(ratio, nan=np.inf), 1e-12))
+        seen = self._in_camera(state)
+        by_seen = np.empty((len(seen), 2, 3))
+        for key in set(self.keys):
+            rows = self._rows(key)
+            by_seen[rows], _ = projection_jacobians(self.camera(key, state), seen[rows])
+        by_point = by_seen @ np.swapaxes(state.rotations, 1, 2)[self.image]
+        n = len(state.points)
+        pp = self._by_point(weight[:, None, None] * (np.swapaxes(by_point, 1, 2) @ by_point), n)
+        p = self._by_point(np.einsum("mki,m,mk->mi", by_point, weight, np.nan_to_num(residual)), n)
+        trace = np.einsum("nii->n", pp)
+        return np.linalg.solve(pp + (LEAST_DAMPING * trace + (trace == 0.0))[:, None, None] * np.eye(3), p[:, :, None])[
+            ..., 0
+        ]
+
+    def minimised(self, state: State, noise_px: float, most: int = MAX_ITERATIONS) -> tuple[State, int]:
         """Return the state of least cost near this one, and the number of iterations."""
         cost, damping = self.cost(state, noise_px), FIRST_DAMPING
-        for iteration in range(1, MAX_ITERATIONS + 1):
+        for iteration in range(1, most + 1):
             normal = self.normal_equations(state, noise_px)
             trial = self.moved(state, *normal.step(damping))
-            while not self.cost(trial, noise_px) <= cost:
+            while not (trial_cost := self.cost(trial, noise_px)) <= cost:
                 damping *= 10.0
                 if damping > MOST_DAMPING:
                     return state, iteration
                 trial = self.moved(state, *normal.step(damping))
-            decrease = cost - self.cost(trial, noise_px)
-            state, cost, damping = trial, cost - decrease, max(damping / 10.0, LEAST_DAMPING)
+            decrease = cost - trial_cost
+            state, cost, damping = trial, trial_cost, max(damping / 10.0, LEAST_DAMPING)
             if decrease <= CONVERGED * cost:
                 break
         return state, iteration
@@ -217,28 +197,38 @@ class Bundle:
         total[self.point[starts]] = np.add.reduceat(values, starts)
         return total
 
-    def _poses_and_intrinsics(self, by_pose: Float, by_intrinsics: Float, residual: Float) -> tuple[Any, Float]:
-        """Return the sparse matrix (D, D) and the right side (D,) of the poses and intrinsics."""
+    def _poses_and_shared(
+        self, state: State, by_pose: Float, by_intrinsics: Float, residual: Float
+    ) -> tuple[Any, Float]:
+        """Return the sparse matrix (D, D) and the right side (D,) of the poses and shared unknowns."""
         from scipy import sparse
 
-        n_images, n_keys = len(self.keys), len(self.free)
+        n_images, size = len(self.keys), len(PARAMETERS)
+        n_lens, n_biases = size * len(self.free), len(state.biases)
         pose_t, intrinsics_t = np.swapaxes(by_pose, 1, 2), np.swapaxes(by_intrinsics, 1, 2)
-        key = np.array([self.free.index(k) if k in self.free else -1 for k in self.keys])
-        of_free = np.flatnonzero(key >= 0)
-        poses = sparse.block_diag(self._by_image(pose_t @ by_pose))
-        size = len(PARAMETERS)
-        mixed = sparse.lil_matrix((6 * n_images, size * n_keys))
-        own, shared = np.zeros((n_keys, size, size)), np.zeros((n_keys, size))
+        poses, right = self._by_image(pose_t @ by_pose), self._by_image(np.einsum("mki,mk->mi", by_pose, residual))
+        mixed = np.zeros((n_images, 6, n_lens + n_biases))
+        shared, shared_right = np.zeros((n_lens + n_biases,) * 2), np.zeros(n_lens + n_biases)
         crossed, squared = self._by_image(pose_t @ by_intrinsics), self._by_image(intrinsics_t @ by_intrinsics)
-        for image in of_free:
-            mixed[6 * image : 6 * image + 6, size * key[image] : size * (key[image] + 1)] = crossed[image]
-            own[key[image]] += squared[image]
         gradient = self._by_image(np.einsum("mki,mk->mi", by_intrinsics, residual))
-        np.add.at(shared, key[of_free], gradient[of_free])
-        right = np.append(self._by_image(np.einsum("mki,mk->mi", by_pose, residual)), shared)
-        if n_keys == 0:
-            return poses.tocsr(), right
-        return sparse.bmat([[poses, mixed], [mixed.T, sparse.block_diag(own)]], format="csr"), right
+        deviation = self.deviation(state)
+        prior_weight = self.prior_weight / (1.0 + deviation**2 / STUDENT)
+        for k, key in enumerate(self.free):
+            own, lens = np.flatnonzero(np.array(self.keys) == key), slice(k * size, (k + 1) * size)
+            mixed[own, :, lens] = crossed[own]
+            prior = self.whitening[k].T * prior_weight[k]
+            shared[lens, lens] = squared[own].sum(axis=0) + prior @ self.whitening[k]
+            shared_right[lens] = gradient[own].sum(axis=0) - prior @ deviation[k]
+        if self.ties:
+            tied = self.ties.cameras(state.rotations, state.centres, state.biases)
+            poses, right = poses + tied.poses, right + tied.poses_right
+            mixed[:, :, n_lens:] = tied.mixed
+            shared[n_lens:, n_lens:], shared_right[n_lens:] = tied.biases, tied.biases_right
+        both = np.append(right, shared_right)
+        if n_lens + n_biases == 0:
+            return sparse.block_diag(poses).tocsr(), both
+        across = sparse.csr_matrix(mixed.reshape(6 * n_images, -1))
+        return sparse.bmat([[sparse.block_diag(poses), across], [across.T, shared]], format="csr"), both
 
     def _by_image(self, values: Float) -> Float:
         order = np.argsort(self.image, kind="stable")
@@ -247,15 +237,3 @@ class Bundle:
         total = np.zeros((len(self.keys), *values.shape[1:]))
         total[rows[starts]] = np.add.reduceat(values[order], starts)
         return total
-
-    def _priors(self, state: State) -> tuple[Any, Float]:
-        """Return what the priors add to matrix (D, D) and right side (D,)."""
-        from scipy import sparse
-
-        first = 6 * len(self.keys)
-        blocks, right = [sparse.csr_matrix((first, first))], [np.zeros(first)]
-        for whitening, deviation in zip(self.whitening, self.deviation(state), strict=True):
-            weighted = whitening.T / (1.0 + deviation**2 / STUDENT)
-            blocks.append(sparse.csr_matrix(weighted @ whitening))
-            right.append(-weighted @ deviation)
-        return sparse.block_diag(blocks, format="csr"), np.concatenate(right)

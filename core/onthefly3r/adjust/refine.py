@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +17,9 @@ from ..geometry.camera import Camera
 from ..geometry.transforms import Rigid3, Sim3
 from ..records import Observations, PlacedMap, Shot
 from .bundle import Bundle, State
+from .evidence import PrincipalPoint, calibrate
 from .intrinsics import PARAMETERS, intrinsics_of
-from .selfcal import IntrinsicsPrior, adjustable, effective_weight
+from .selfcal import IntrinsicsPrior
 
 OBSERVATIONS = 40_000  # to aim at in all: a small map uses all that it has,
 CELLS = 6  # an image at least
@@ -25,7 +27,6 @@ LEAST_PER_CELL = 3  # of its longest tracks in each of 6 x 6 cells
 MIN_IMAGES = 3
 MIN_OBSERVATIONS = 20  # an image with fewer follows the nearest refined one of its submap
 ABSURD = 0.1  # of the image's longest side: an observation that starts farther off is a mismatch
-NOISE_ROUNDS = 3  # how often the pixel noise is estimated anew; the first one is that of the drift
 
 
 @dataclass(frozen=True)
@@ -45,14 +46,14 @@ class Refinement:
 
     map_from_submap: Mapping[int, Sim3]  # by shot index
     calibrations: Mapping[str, Camera]  # by camera key, photograph size
-    notes: Mapping[str, float]
+    notes: Mapping[str, Any]  # JSON values for the report
 
 
 def refine(
     state: PlacedMap,
     observed: Iterable[tuple[int, Observations]],
     shots: Mapping[int, Shot],
-    principal_point: bool = False,
+    principal_point: PrincipalPoint = "auto",
 ) -> Refinement | None:
     """Adjust all cameras that share enough tracks; None when there are none (neural backbones), or it does not settle.
 
@@ -60,24 +61,22 @@ def refine(
         state: the map; it is only read.
         observed: observations by number of the submap that made them.
         shots: at least those of the map.
-        principal_point: adjust that of the cameras too.
+        principal_point: whether that of the cameras is free, held in the middle, or as the evidence says.
     """
-    may_change = adjustable(principal_point)
     tracks = chosen_tracks(joined_tracks(state, observed), state.frames)
     if len(_images(tracks)) < MIN_IMAGES:
         return None
-    tracks = _only(tracks, _plausible(tracks, state, shots, may_change))
+    tracks = _only(tracks, _plausible(tracks, state, shots))
     images = _images(tracks)
     if len(images) < MIN_IMAGES:
         return None
-    bundle = _bundle(tracks, images, state, shots, may_change)
+    bundle = _bundle(tracks, images, state, shots)
     start = _start(tracks, images, state, bundle.free)
-    adjusted = start
     try:
-        for _ in range(NOISE_ROUNDS):
-            adjusted, _ = bundle.minimised(adjusted, bundle.noise_px(adjusted))
+        solved = calibrate(bundle, start, principal_point)
     except (np.linalg.LinAlgError, RuntimeError):  # singular: numpy's word for it and SuperLU's
         return None
+    adjusted = solved.state
     before, after = (np.linalg.norm(bundle.residuals(s), axis=1) for s in (start, adjusted))
     if not np.median(after) <= np.median(before):
         return None
@@ -90,6 +89,7 @@ def refine(
             "refined_points": float(len(tracks.points)),
             "reprojection_before_px": float(np.median(before)),
             "reprojection_after_px": float(np.median(after)),
+            "principal_point": dict(solved.verdict),
         },
     )
 
@@ -144,10 +144,10 @@ def chosen_tracks(tracks: Tracks, frames: Mapping[int, object]) -> Tracks:
     return _only(tracks, enough[tracks.image])
 
 
-def _plausible(tracks: Tracks, state: PlacedMap, shots: Mapping[int, Shot], may_change: Bool) -> Bool:
+def _plausible(tracks: Tracks, state: PlacedMap, shots: Mapping[int, Shot]) -> Bool:
     """Return which observations (M,) lie in front of their cameras and not absurdly far from where they should be."""
     images = _images(tracks)
-    bundle = _bundle(tracks, images, state, shots, may_change)
+    bundle = _bundle(tracks, images, state, shots)
     residual = np.linalg.norm(bundle.residuals(_start(tracks, images, state, bundle.free)), axis=1)
     longest = np.array([max(shots[i].width_px, shots[i].height_px) for i in images])
     # False where the residual is NaN, behind the camera.
@@ -192,9 +192,7 @@ def _collected(
     return image, feature, pixel, depth, point, np.concatenate(points)
 
 
-def _bundle(
-    tracks: Tracks, images: tuple[int, ...], state: PlacedMap, shots: Mapping[int, Shot], may_change: Bool
-) -> Bundle:
+def _bundle(tracks: Tracks, images: tuple[int, ...], state: PlacedMap, shots: Mapping[int, Shot]) -> Bundle:
     row = np.searchsorted(np.array(images), tracks.image)
     keys = tuple(shots[i].camera_key for i in images)
     free = tuple(sorted(set(keys) & set(state.calibrations)))
@@ -203,13 +201,13 @@ def _bundle(
         image=row,
         point=tracks.point,
         pixel=tracks.pixel,
-        weight=effective_weight(row),
+        weight=np.ones(len(row)),
         keys=keys,
         free=free,
         cameras={**{shots[i].camera_key: _camera(i, state, shots) for i in images}},
         mean=np.array([prior.mean() for prior in priors]).reshape(-1, len(PARAMETERS)),
         whitening=np.array([prior.whitening() for prior in priors]).reshape(-1, len(PARAMETERS), len(PARAMETERS)),
-        adjustable=may_change,
+        adjustable=np.ones(len(PARAMETERS), bool),
     )
 
 

@@ -1,9 +1,8 @@
 """Self-calibration of the first model: bundle adjustment that keeps the intrinsics near what is known of them.
 
 Free self-calibration over-fits on weak geometry: over flat ground a wrong focal length costs a few hundredths of
-a pixel, less than what a rolling shutter or a lens leaves in the residuals. The maximum a posteriori estimate has
-two remedies. Intrinsics have priors; and because the residuals of one image share such causes, an image counts as
-a few independent observations, not as the hundreds it has.
+a pixel, less than what a rolling shutter or a lens leaves in the residuals. So intrinsics have priors, and
+`evidence.py` finds out what the images tell of them.
 """
 
 from __future__ import annotations
@@ -13,16 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..geometry.arrays import Bool, Float, Int
+from ..geometry.arrays import Float, Int
 from ..geometry.camera import Camera
 from ..geometry.transforms import Rigid3
 from ..records import Features
 from .bundle import Bundle, State
-from .intrinsics import PARAMETERS, WITHOUT_PRINCIPAL_POINT, intrinsics_of
+from .evidence import PrincipalPoint, calibrate
+from .intrinsics import PARAMETERS, intrinsics_of
 from .sparse_model import SparseModel
-
-EFFECTIVE_OBSERVATIONS = 10.0  # independent observations that one image is worth
-SCALE_ROUNDS = 2  # how often the pixel noise is estimated anew
 
 
 @dataclass(frozen=True)
@@ -40,8 +37,8 @@ class IntrinsicsPrior:
     aspect_sigma: float = 0.003
     corner_sigma: float = 0.005  # of k1 r^2 + k2 r^4 at the corner
     wave_sigma: float = 0.03  # of k2 r^4 at the corner
-    tangential_sigma: float = 0.001  # of p1 r and p2 r at the corner
-    centre_sigma: float = 0.003  # of the principal point, as a fraction of the longest side
+    tangential_sigma: float = 0.003  # of p1 r and p2 r at the corner
+    centre_sigma: float = 0.01  # of the principal point, as a fraction of the longest side
 
     def mean(self) -> Float:
         """Return the mean (8,) of `PARAMETERS`."""
@@ -68,6 +65,7 @@ class SelfCalibration:
     model: SparseModel
     sigma: Mapping[str, Float]  # (8,) posterior standard deviation of PARAMETERS
     shift: Mapping[str, Float]  # (8,) estimate minus prior in prior standard deviations; k1: remainder at the corner
+    verdict: Mapping[str, str]  # what became of the principal point, and why
     notes: Mapping[str, float]  # figures for the report
 
 
@@ -77,46 +75,33 @@ def self_calibrate(
     keys: Mapping[int, str],
     priors: Mapping[str, IntrinsicsPrior],
     held: frozenset[str] = frozenset(),
-    principal_point: bool = False,
+    principal_point: PrincipalPoint = "auto",
 ) -> SelfCalibration:
     """Adjust poses, points and the intrinsics of all camera keys outside `held`; the frame stays about the same.
 
     `model` is best built with the free intrinsics at their priors' means. `priors` holds every key that is free;
-    a held key keeps the model's camera, and without `principal_point` all keep that. Pixels are of the working images.
+    a held key keeps the model's camera. Pixels are of the working images.
     """
-    bundle, images = _bundle(model, features, keys, priors, held, adjustable(principal_point))
-    state = _start(model, images, bundle.free)
-    before = np.linalg.norm(bundle.residuals(state), axis=1)
-    iterations = 0
-    for _ in range(SCALE_ROUNDS):
-        noise_px = bundle.noise_px(state)
-        state, used = bundle.minimised(state, noise_px)
-        iterations += used
+    bundle, images = _bundle(model, features, keys, priors, held)
+    start = _start(model, images, bundle.free)
+    before = np.linalg.norm(bundle.residuals(start), axis=1)
+    solved = calibrate(bundle, start, principal_point)
+    bundle, state, noise_px = solved.bundle, solved.state, solved.noise_px
     after = np.linalg.norm(bundle.residuals(state), axis=1)
-    variance = np.diag(bundle.normal_equations(state, noise_px).intrinsics_covariance())
+    variance = np.diag(bundle.normal_equations(state, noise_px).shared_covariance())
     sigma = np.sqrt(variance).reshape(-1, len(PARAMETERS))
     return SelfCalibration(
         model=_adjusted(model, bundle, images, state, after),
         sigma=dict(zip(bundle.free, sigma, strict=True)),
         shift=dict(zip(bundle.free, bundle.deviation(state), strict=True)),
+        verdict=solved.verdict,
         notes={
             "pixel_noise_px": noise_px,
-            "iterations": float(iterations),
+            "iterations": float(solved.iterations),
             "reprojection_before_px": float(before.mean()),
             "reprojection_after_px": float(after.mean()),
         },
     )
-
-
-def adjustable(principal_point: bool) -> Bool:
-    """Return which of `PARAMETERS` may change."""
-    return WITHOUT_PRINCIPAL_POINT | principal_point
-
-
-def effective_weight(image: Int) -> Float:
-    """Return the weights (M,) under which the observations of one image, named by its row, count as a few."""
-    count = np.bincount(image)
-    return np.asarray(np.minimum(1.0, EFFECTIVE_OBSERVATIONS / np.maximum(count, 1))[image])
 
 
 def _bundle(
@@ -125,7 +110,6 @@ def _bundle(
     keys: Mapping[int, str],
     priors: Mapping[str, IntrinsicsPrior],
     held: frozenset[str],
-    may_change: Bool,
 ) -> tuple[Bundle, tuple[int, ...]]:
     images = tuple(sorted(model.local_from_cam))
     image_keys = tuple(keys[i] for i in images)
@@ -146,13 +130,13 @@ def _bundle(
         image=image[order],
         point=point[order],
         pixel=np.concatenate(pixels)[order],
-        weight=effective_weight(image[order]),
+        weight=np.ones(len(order)),
         keys=image_keys,
         free=free,
         cameras=model.cameras,
         mean=np.array([priors[key].mean() for key in free]).reshape(-1, len(PARAMETERS)),
         whitening=np.array([priors[key].whitening() for key in free]).reshape(-1, len(PARAMETERS), len(PARAMETERS)),
-        adjustable=may_change,
+        adjustable=np.ones(len(PARAMETERS), bool),
     )
     return bundle, images
 

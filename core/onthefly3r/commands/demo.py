@@ -74,8 +74,7 @@ def run_demo(
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / "truth" / "origin.json").exists())):
         raise InputError(f"{out} exists and is not an earlier demonstration: name a new folder")
     survey = simulate_survey(out, survey_options or SurveyOptions(), progress)
-    # The made-up camera is off centre, as real ones are.
-    options = Options.from_flat({"principal_point": True})
+    options = Options()
     result = reconstruct(out / "photos", out / "result", options, progress, cancel)
     accuracy = compare_with_truth(result.report, out / "result", survey, options)
     part = out / "accuracy.json.part"

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -82,7 +83,7 @@ class Engine:
         self._residuals: list[float] = []  # of all alignments, map units
         self._drift_shows = False
         self.pruned_references = 0
-        self.refinement: Mapping[str, float] = {}
+        self.refinement: Mapping[str, Any] = {}
         self.warnings: list[str] = []
         self._backbone = backbone
         self._describer = describer
@@ -118,7 +119,7 @@ class Engine:
         """How often each image was rejected that ever was."""
         return self._retry.attempts
 
-    def details(self) -> dict[str, float]:
+    def details(self) -> dict[str, Any]:
         """Return figures of the run for the report."""
         return {
             "submaps": float(len(self.state.map_from_submap)),
