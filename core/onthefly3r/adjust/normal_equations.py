@@ -73,7 +73,7 @@ class NormalEquations:
         return self._solver(self.eliminated(0.0)[2])
 
     def _solver(self, matrix: Any) -> Any:
-        """Return a solver of the system of C, scaled to a unit diagonal of `cc`: rotations and metres are alike there."""
+        """Return a solver of the system of C, scaled to a unit diagonal of `cc`: rotations and metres are alike."""
         from scipy import sparse
         from scipy.sparse.linalg import splu
 
