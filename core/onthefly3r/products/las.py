@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -42,6 +44,73 @@ def las_scale_m(spacing_m: float) -> float:
     return float(min(1e-3, 10.0 ** np.floor(np.log10(spacing_m / 10.0) + 1e-9)))
 
 
+class CloudWriter:
+    """A LAS or LAZ file that is written tile by tile; a context manager, whose `summary` is there at its end.
+
+    Red, green and blue are 16 bit (8 bit x 257). Point source id is the image number from 1 (shot index + 1); with
+    more images than it can count, it is 0 and the extra dimension `image` holds the number. Further extra dimensions:
+    `confidence` 0..255, `batch`, `n_views` (also in user data, which QGIS keeps). Every point is return 1 of 1 and
+    class 0. A `<name>.copc.laz` left beside by QGIS is removed, because QGIS would show it instead.
+    """
+
+    def __init__(self, path: Path, wkt1: str | None, scale_m: float, description: str = "", n_images: int = 0) -> None:
+        """See `write_cloud` for the arguments."""
+        self._path, self._wkt, self._scale_m = path, wkt1 or LOCAL_WKT1, scale_m
+        self._description, self._wide = description, n_images > MAX_POINT_SOURCE
+        self._files = ExitStack()
+        self._writer: Any = None
+        self._header: Any = None
+        self._spacing, self._counted = 0.0, 0
+        self._sample: list[Float] = []
+        self.summary: CloudSummary | None = None
+
+    def __enter__(self) -> CloudWriter:
+        return self
+
+    def add(self, tile: CloudTile) -> None:
+        """Write the points of a tile in the export frame."""
+        if not len(tile.points):
+            return
+        if self._writer is None:
+            self._open(np.round(tile.points.mean(axis=0)))
+        self._writer.write_points(_record(tile, self._header, self._wide))
+        self._sample.append(tile.points[::WINDOW_STRIDE, :2])
+        spacing = point_spacing(tile.points)
+        if np.isfinite(spacing):
+            self._spacing, self._counted = self._spacing + spacing * len(tile.points), self._counted + len(tile.points)
+
+    def _open(self, offset: Float) -> None:
+        import laspy
+
+        self._header = _header(offset, self._scale_m, self._wkt, self._description, self._wide)
+        temporary = self._files.enter_context(replacing(self._path))
+        compress = self._path.suffix.lower() == ".laz"
+        self._writer = self._files.enter_context(
+            laspy.open(temporary, mode="w", header=self._header, do_compress=compress)
+        )
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._files.__exit__(kind, error, trace) or kind is not None:
+            return
+        if self._writer is None:
+            raise ReconstructionError(
+                "the cloud has no points; lower min_confidence, or look at the rejected images in the report"
+            )
+        self._path.with_name(f"{self._path.stem}.copc.laz").unlink(missing_ok=True)
+        written = self._writer.header
+        low, high = np.quantile(np.concatenate(self._sample), [WINDOW_TAIL, 1.0 - WINDOW_TAIL], axis=0)
+        (min_x, min_y, min_z), (max_x, max_y, max_z) = (map(float, ends) for ends in (written.mins, written.maxs))
+        self.summary = CloudSummary(
+            path=self._path,
+            points=int(written.point_count),
+            bounds=(min_x, min_y, min_z, max_x, max_y, max_z),
+            window=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
+            mean_spacing_m=self._spacing / self._counted if self._counted else float("nan"),
+        )
+
+
 def write_cloud(
     path: Path,
     tiles: Iterator[CloudTile],
@@ -50,12 +119,7 @@ def write_cloud(
     description: str = "",
     n_images: int = 0,
 ) -> CloudSummary:
-    """Write the tiles one after the other and return what the file holds; `.laz` compresses, `.las` does not.
-
-    Red, green and blue are 16 bit (8 bit x 257). Point source id is the image number from 1 (shot index + 1); with
-    more images than it can count, it is 0 and the extra dimension `image` holds the number. Further extra dimensions:
-    `confidence` 0..255, `batch`, `n_views` (also in user data, which QGIS keeps). Every point is return 1 of 1 and
-    class 0. A `<name>.copc.laz` left beside by QGIS is removed, because QGIS would show it instead.
+    """Write the tiles one after the other as `CloudWriter` does, and return what the file holds.
 
     Args:
         path: final name, ending in .las or .laz.
@@ -68,40 +132,11 @@ def write_cloud(
     Raises:
         ReconstructionError: no tile has a point, or the coordinates do not fit 32 bit at this scale.
     """
-    import laspy
-
-    tiles = iter(tile for tile in tiles if len(tile.points))
-    first = next(tiles, None)
-    if first is None:
-        raise ReconstructionError(
-            "the cloud has no points; lower min_confidence, or look at the rejected images in the report"
-        )
-    wide = n_images > MAX_POINT_SOURCE
-    header = _header(np.round(first.points.mean(axis=0)), scale_m, wkt1 or LOCAL_WKT1, description, wide)
-    spacing, count = 0.0, 0
-    sample: list[Float] = []
-    compress = path.suffix.lower() == ".laz"
-    with replacing(path) as temporary:
-        with laspy.open(temporary, mode="w", header=header, do_compress=compress) as writer:
-            tile: CloudTile | None = first
-            while tile is not None:
-                writer.write_points(_record(tile, header, wide))
-                sample.append(tile.points[::WINDOW_STRIDE, :2])
-                tile_spacing = point_spacing(tile.points)
-                if np.isfinite(tile_spacing):
-                    spacing, count = spacing + tile_spacing * len(tile.points), count + len(tile.points)
-                tile = next(tiles, None)
-            written = writer.header
-        path.with_name(f"{path.stem}.copc.laz").unlink(missing_ok=True)
-    low, high = np.quantile(np.concatenate(sample), [WINDOW_TAIL, 1.0 - WINDOW_TAIL], axis=0)
-    (min_x, min_y, min_z), (max_x, max_y, max_z) = (map(float, ends) for ends in (written.mins, written.maxs))
-    return CloudSummary(
-        path=path,
-        points=int(written.point_count),
-        bounds=(min_x, min_y, min_z, max_x, max_y, max_z),
-        window=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
-        mean_spacing_m=spacing / count if count else float("nan"),
-    )
+    with CloudWriter(path, wkt1, scale_m, description, n_images) as writer:
+        for tile in tiles:
+            writer.add(tile)
+    assert writer.summary is not None
+    return writer.summary
 
 
 def _header(offset: Float, scale_m: float, wkt1: str, description: str, wide: bool) -> Any:

@@ -25,10 +25,12 @@ from ..map.state import MapState
 from ..map.store import Store
 from ..options import Options, slice_classes
 from ..products.clip import read_rings
+from ..products.exportframe import ExportFrame
 from ..products.las import CloudSummary
 from ..products.page import write_page
 from ..products.report import RejectedImage, RunSummary, Timing, build_report, write_report
-from ..products.writing import ExportFrame, remove_products, write_products
+from ..products.runview import RunView
+from ..products.writing import remove_products, write_products
 from ..protocol import Progress, ProgressCallback
 from ..records import GeoReference, RefusedPhotograph, Rejection, Shot
 from ..selection.describer import create_describer
@@ -211,20 +213,21 @@ def _finish(
             else:
                 reference = georeference(poses, outcome.shots, options.georeference, up)
         with stopwatch.stage("export"):
-            cloud = write_products(
-                out,
-                work,
-                state,
-                store,
-                outcome.shots,
-                outcome.rejections,
-                outcome.retries,
-                reference,
-                ExportFrame.of(reference, up, metres_per_unit),
-                options,
-                out.resolve().name,
-                checkpoint,
+            view = RunView(
+                title=out.resolve().name,
+                options=options,
+                state=state,
+                store=store,
+                shots=outcome.shots,
+                rejections=outcome.rejections,
+                retries=outcome.retries,
+                refused=outcome.refused,
+                reference=reference,
+                frame=ExportFrame.of(reference, up, metres_per_unit),
+                work=work,
+                checkpoint=checkpoint,
             )
+            cloud = write_products(out, view).get("cloud")
     except ReconstructionError as error:
         failure = error
     summary = RunSummary(

@@ -12,7 +12,8 @@ from onthefly3r.geometry.frames import enu_from_cam_rotation, gimbal_angles_deg
 from onthefly3r.geometry.geodesy import EnuFrame, WorldFrame
 from onthefly3r.geometry.transforms import Rigid3, Sim3
 from onthefly3r.options import Options
-from onthefly3r.products.writing import ExportFrame, camera_rows, placed_cameras
+from onthefly3r.products.cameras import camera_rows, placed_cameras
+from onthefly3r.products.exportframe import ExportFrame
 from onthefly3r.records import Rejection
 from oracle_runs import run, survey_of
 

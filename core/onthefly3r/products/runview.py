@@ -1,0 +1,69 @@
+"""What products are written from: a run that ended, or as much of it as there is, in one frozen object."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from ..map.state import MapState
+from ..map.store import Store
+from ..options import Options
+from ..records import GeoReference, PlacedCamera, RefusedPhotograph, Rejection, Shot
+from .cameras import camera_rows, footprints, placed_cameras
+from .exportframe import ExportFrame
+from .footprints import Footprint
+from .rows import CameraRow
+
+
+@dataclass(frozen=True)
+class RunView:
+    """A run as its products see it; cameras, rows and footprints are worked out when first asked for."""
+
+    title: str
+    options: Options
+    state: MapState
+    store: Store
+    shots: Mapping[int, Shot]
+    rejections: Mapping[int, Rejection]
+    retries: Mapping[int, int]
+    refused: Sequence[RefusedPhotograph]
+    reference: GeoReference | None  # None: local coordinates
+    frame: ExportFrame
+    work: Path  # for temporary files
+    checkpoint: Callable[[str, int, int], None]  # (stage, done, total); may raise `Cancelled`
+
+    @property
+    def crs(self) -> str | None:
+        """The projected CRS of the files, None for local coordinates."""
+        return self.reference.crs if self.reference else None
+
+    @property
+    def unit(self) -> str:
+        """The unit of lengths in the files."""
+        return "m" if self.frame.metric else "map units"
+
+    @cached_property
+    def cameras(self) -> list[PlacedCamera]:
+        """The placed cameras in the export frame, at photograph size, in the order of the shots."""
+        return placed_cameras(self.state, self.shots, self.retries, self.frame)
+
+    @cached_property
+    def rows(self) -> list[CameraRow]:
+        """One row per photograph, placed ones first, both in capture order."""
+        return camera_rows(
+            self.cameras,
+            self.state,
+            self.shots,
+            self.rejections,
+            self.retries,
+            self.reference,
+            self.frame,
+            self.options,
+        )
+
+    @cached_property
+    def footprints(self) -> list[Footprint]:
+        """What the placed cameras cover on the ground."""
+        return footprints(self.cameras, self.state, self.frame)
