@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from onthefly3r.options import ExportOptions, Options
-from onthefly3r.products.exportframe import ExportFrame
 from onthefly3r.products.catalogue import PRODUCTS
+from onthefly3r.products.exportframe import ExportFrame
 from onthefly3r.products.runview import RunView
 from onthefly3r.products.writing import remove_products, write_products
 from oracle_runs import run, survey_of

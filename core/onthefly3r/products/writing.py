@@ -6,8 +6,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from .cloudpass import cloud_tiles
 from .catalogue import PRODUCTS, Product
+from .cloudpass import cloud_tiles
 from .runview import RunView
 
 
