@@ -149,7 +149,7 @@ def survey(work: Path, seed: int, curvatures: np.ndarray, unit: float = 1.0) -> 
                 sightings.append(Sighting(index, number, first_from_enu @ view_from_enu.inverse(), cam))
         map_from_submap = Sim3(unit, np.eye(3), np.zeros(3)) @ submap_from_enu.inverse()
         state.commit(Submap(number, map_from_submap, tuple(frames), tuple(sightings)), [])
-    state.spacing = 0.01 * unit
+    state.set_spacing(0.01 * unit)
     return state, truth
 
 
@@ -226,7 +226,7 @@ def test_a_strip_that_registration_has_just_left_is_not_bent_for_it(tmp_path: Pa
             whole.map_from_submap[0] if number == 0 else state.submap_pose_of(seen[0].frame) @ seen[0].frame_from_submap
         )
         state.commit(Submap(number, pose, frames, seen), [])
-    state.spacing = 0.01
+    state.set_spacing(0.01)
     found = []
 
     def spied(*known: Any) -> Bending:

@@ -89,7 +89,7 @@ def state_of(work: Path, poses: dict[int, Sim3], edges: list[Edge]) -> MapState:
     for k, pose in poses.items():
         frame = Frame(100 + k, k, CAMERA, PixelMap(1.0, 1.0), Rigid3(), 1.0)
         state.commit(Submap(k, pose, (frame,), tuple(sighting(e) for e in edges if e.target == k)), [])
-    state.spacing = 0.1
+    state.set_spacing(0.1)
     return state
 
 
@@ -218,7 +218,7 @@ def block(work: Path, seed: int, n_submaps: int = 12, n_frames: int = 60, seen: 
             submap_from_scene, submap_from_cam = view(k, i)
             sightings.append(Sighting(i, k, own[i][1] @ submap_from_scene.inverse(), submap_from_cam))
         state.commit(Submap(k, pose, frames, tuple(sightings)), [])
-    state.spacing = 0.1
+    state.set_spacing(0.1)
     return state, cameras
 
 

@@ -41,7 +41,7 @@ def state(tmp_path: Path) -> MapState:
             frames.append(NewFrame(frame, reference, empty, empty.astype(np.uint8), np.zeros(0, np.uint8)))
         submap = Submap(number, MAP_FROM_SUBMAP[number], tuple(new.frame for new in frames), ())
         state.commit(submap, frames)
-    state.spacing = scene_spacing({0: true_view(0)}, 0.5)
+    state.set_spacing(scene_spacing({0: true_view(0)}, 0.5))
     return state
 
 

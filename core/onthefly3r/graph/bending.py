@@ -64,8 +64,12 @@ def sheets(state: MapState) -> dict[int, Sheet]:
     for frame in state.frames.values():
         poses.setdefault(frame.submap, []).append(frame.submap_from_cam)
         depths.setdefault(frame.submap, []).extend([frame.depth] if frame.depth else [])
+    own = set(depths)
     for seen in state.sightings:
         poses.setdefault(seen.submap, []).append(seen.submap_from_cam)
+        if seen.submap not in own:  # it joined two fragments, and has no new frames: it is as far off as what it saw
+            depth = state.frames[seen.frame].depth / seen.frame_from_submap.scale
+            depths.setdefault(seen.submap, []).extend([depth] if depth else [])
     return {submap: sheet(poses[submap], float(np.median(known)) if known else 0.0) for submap, known in depths.items()}
 
 

@@ -96,7 +96,7 @@ def _balance(
     edges = [view_edge(seen, state.map_from_submap[seen.submap].scale, noise) for seen in straight]
     known = [_straightened(prior, bending) for prior in priors]
     agreeing = consistent_priors(known, submap_edges(straight, state, noise)) if known else []
-    return solver.solve_sim3(nodes, edges, agreeing, fixed=0)
+    return solver.solve_sim3(nodes, edges, agreeing, fixed=min(state.map_from_submap))
 
 
 def _straightened(prior: PosePrior, bending: Bending) -> PosePrior:

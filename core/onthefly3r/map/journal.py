@@ -74,6 +74,7 @@ def submap_to_json(submap: Submap) -> dict[str, Any]:
             for edge in submap.frame_edges
         ],
         "calibrations": {key: asdict(camera) for key, camera in submap.calibrations.items()},
+        "fragment": submap.fragment,
     }
 
 
@@ -112,7 +113,9 @@ def submap_from_json(value: Any) -> Submap:
     )
     calibrations = {str(key): camera_from_json(camera) for key, camera in value["calibrations"].items()}
     pose = sim3_from_json(value["map_from_submap"])
-    return Submap(int(value["number"]), pose, frames, sightings, frame_edges, calibrations)
+    return Submap(
+        int(value["number"]), pose, frames, sightings, frame_edges, calibrations, int(value.get("fragment", 0))
+    )
 
 
 def shot_to_json(shot: Shot) -> dict[str, Any]:

@@ -42,6 +42,7 @@ class Store:
         self._chunks = work / "chunks"
         self._journal = work / "journal.jsonl"
         self._chunk_of: dict[int, int] = {}
+        self._submaps: list[int] = []
         self._recent: OrderedDict[int, CompactReference] = OrderedDict()
 
     def commit(self, submap: Submap, frames: Sequence[NewFrame], observations: Observations | None = None) -> None:
@@ -66,6 +67,7 @@ class Store:
             os.fsync(stream.fileno())  # the journal must not name what a power cut took
         temporary.replace(path)
         self.note("submap", submap_to_json(submap))
+        self._submaps.append(submap.number)
         for new in frames:
             self._chunk_of[new.frame.index] = submap.number
             self._remember(new.frame.index, new.reference)
@@ -94,6 +96,7 @@ class Store:
                 except (ValueError, AttributeError) as error:
                     raise InputError(f"{self._journal}, line {number}: damaged ({error}); run again") from error
                 if kind == "submap":
+                    self._submaps.append(int(value.get("number", 0)))  # a damaged one is told by who reads it
                     self._chunk_of.update({int(f["index"]): int(value["number"]) for f in value["frames"]})
                 yield kind, value
 
@@ -122,7 +125,7 @@ class Store:
     def stream_observations(self) -> Iterator[tuple[int, Observations]]:
         """Yield what the backbone tied together in each submap, by its number; nothing where it does not tell."""
         names = [field.name for field in fields(Observations)]
-        for submap in dict.fromkeys(self._chunk_of.values()):
+        for submap in self._submaps:
             with np.load(self._chunk_path(submap), allow_pickle=False) as chunk:
                 if f"observations/{names[0]}" in chunk:
                     yield submap, Observations(**{name: chunk[f"observations/{name}"] for name in names})
