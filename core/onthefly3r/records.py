@@ -277,7 +277,10 @@ class Submap:
 class PlacedMap(Protocol):
     """What stages that only read the map see of it: accepted frames, their poses and their compact references."""
 
-    spacing: float  # l_scene, map units
+    @property
+    def spacing(self) -> float:
+        """l_scene, map units."""
+        ...
 
     @property
     def frames(self) -> Mapping[int, Frame]:
