@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from onthefly3r.earth.georef import georeference, world_frame
+from onthefly3r.earth.georef import check_crs, georeference, world_frame
 from onthefly3r.earth.positions import usable_positions
 from onthefly3r.errors import GeoreferenceError, OptionError
 from onthefly3r.geometry.frames import enu_from_cam_rotation
-from onthefly3r.geometry.geodesy import EnuFrame
+from onthefly3r.geometry.geodesy import EnuFrame, scale_factor
 from onthefly3r.geometry.geoid import egm96_undulation_m
 from onthefly3r.geometry.transforms import Rigid3, Sim3, rotation_exp
 from onthefly3r.intake.folder import read_photographs
@@ -334,6 +334,21 @@ def test_beyond_utm() -> None:
     found = georeference(s.map_from_cam, s.shots(s.noise(0.3), home=home), GeoreferenceOptions(), s.ground_normal)
     assert found.crs == "EPSG:5041"
     assert found.rmse_h_m < 1.0
+
+
+@pytest.mark.parametrize("crs", ["EPSG:3857", "EPSG:3395", "EPSG:6933"])
+def test_a_projection_that_stretches_lengths_is_refused_unless_forced(crs: str) -> None:
+    s = survey(0)
+    shots = s.shots(s.noise(0.02))
+    with pytest.raises(OptionError, match="times the true ones"):
+        check_crs(shots, GeoreferenceOptions(crs=crs))
+    check_crs(shots, GeoreferenceOptions(crs=crs, force_crs=True))
+
+
+def test_scale_factor_of_web_mercator_is_the_secant_of_the_latitude() -> None:
+    assert scale_factor("EPSG:3857", 46.84, -92.0) == pytest.approx(1.0 / np.cos(np.radians(46.84)), rel=0.004)
+    assert scale_factor("EPSG:32633", 48.0, 15.0) == pytest.approx(0.9996, abs=1e-6)
+    assert scale_factor("EPSG:5041", 89.9, 0.0) == pytest.approx(0.994, abs=1e-4)
 
 
 def test_target_crs() -> None:

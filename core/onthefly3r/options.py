@@ -219,6 +219,9 @@ class GeoreferenceOptions(CheckedOptions):
     crs: str | None = option(
         None, "projected CRS of the result; default: UTM zone of the median position", example="EPSG:32633"
     )
+    force_crs: bool = option(
+        False, "accept a CRS whose lengths are wrong by more than 0.2 % where the survey lies", advanced=True
+    )
     vertical: Literal["auto", "ellipsoidal", "egm96", "egm2008"] = option(
         "auto",
         "reference of the photographs' heights; auto uses what the tags state",
@@ -376,6 +379,7 @@ DEFAULT_VALUES: dict[str, Any] = {item.name: item.default for _, item in iterate
 
 CONTRADICTIONS = (
     Contradiction("crs", "local", (True,), "crs: --local writes coordinates without a CRS; use only one of the two"),
+    Contradiction("force_crs", "crs", (None,), "force_crs: no CRS is named; name one with --crs"),
     Contradiction(
         "boundary", "local", (True,), "boundary: --local has no place on the Earth to clip at; use only one of the two"
     ),

@@ -47,6 +47,7 @@ PACKAGES = (
     Package("pyproj", "pyproj"),
     Package("laspy", "laspy"),
     Package("pyshp", "shapefile"),
+    Package("shapely", "shapely"),
     Package("pillow", "PIL"),
     Package("defusedxml", "defusedxml"),
     Package("threadpoolctl", "threadpoolctl"),

@@ -13,6 +13,7 @@ from ..geometry.geodesy import (
     EnuFrame,
     WorldFrame,
     projected_crs,
+    scale_factor,
     transformation_accuracy_m,
     utm_crs_for,
 )
@@ -27,6 +28,7 @@ MIN_POSITIONS = 3
 LINE_RATIO = 0.02  # sideways over lengthwise extent of camera centres that count as one line
 MAX_ROLL_SIGMA_DEG = 15.0  # what positions must tell about the level in its worst direction to do without gimbal
 GIMBAL = "gimbal angles"
+MAX_SCALE_ERROR = 0.002  # of the projection where the survey lies; UTM stays below 0.001 in its zone
 MOST_SCALED = 500  # positions whose distances tell the scale of a local frame,
 FAR_SIGMAS = 5.0  # those that are this much longer than positions are wrong
 
@@ -164,7 +166,21 @@ def _target_crs(options: GeoreferenceOptions, positions: Positions) -> str:
             f"crs: {options.crs} cannot be used at {frame.lat_deg:.4f}, {frame.lon_deg:.4f}; "
             "leave it out for the UTM zone"
         )
+    _require_true_lengths(options, frame)
     return options.crs
+
+
+def _require_true_lengths(options: GeoreferenceOptions, frame: EnuFrame) -> None:
+    """Refuse a projection that stretches lengths where the survey lies, as Web Mercator does, unless it is forced."""
+    crs, best = options.crs or "", utm_crs_for(frame.lat_deg, frame.lon_deg)
+    if options.force_crs or crs.upper() == best:  # the polar system is 0.6 % short, and there is no better one
+        return
+    scale = scale_factor(crs, frame.lat_deg, frame.lon_deg)
+    if not abs(scale - 1.0) <= MAX_SCALE_ERROR:
+        raise OptionError(
+            f"crs: lengths in {crs} are {scale:.4g} times the true ones where the survey lies, so distances, areas and "
+            f"volumes would be wrong. Use {best} or a national grid, or insist with --force-crs"
+        )
 
 
 def _method(solution: LevelFit, positions: Positions) -> str:

@@ -159,6 +159,19 @@ def projected_crs(text: str) -> CRS:
     return crs.to_2d()
 
 
+def scale_factor(crs: str, lat_deg: float, lon_deg: float) -> float:
+    """Return the point scale of a projection at a place, the one of its two directions that is farther from 1.
+
+    1.4 means that lengths in the CRS are 1.4 times those on the ellipsoid (PROJ's meridional and parallel scale).
+    """
+    from pyproj import Proj
+
+    # PROJ takes the place on the CRS's own ellipsoid; the datum shift changes nothing of note.
+    factors = Proj(projected_crs(crs)).get_factors(lon_deg, lat_deg)
+    scales = (float(factors.meridional_scale), float(factors.parallel_scale))
+    return max(scales, key=lambda scale: abs(scale - 1.0))
+
+
 def transformation_accuracy_m(crs: str, lat_deg: float, lon_deg: float) -> float:
     """Return PROJ's stated accuracy of WGS 84 -> `crs` at a place with the grids at hand; NaN when it does not know.
 

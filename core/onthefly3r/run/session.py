@@ -24,7 +24,7 @@ from ..map.journal import shot_from_json, shot_to_json
 from ..map.state import MapState
 from ..map.store import Store
 from ..options import Options, slice_classes
-from ..products.clip import read_rings
+from ..products.clip import require_boundary_near
 from ..products.exportframe import ExportFrame
 from ..products.las import CloudSummary
 from ..products.page import write_page
@@ -82,8 +82,6 @@ def reconstruct(
     """
     photos, out, options = Path(photos), Path(out), options or Options()
     stopwatch = Stopwatch()
-    if options.export.boundary is not None:
-        read_rings(Path(options.export.boundary))  # a wrong one is told before the work, not after it
     features = FeatureStore(out / "work" / "features", options.backbone.features, options.backbone.threads)
     backbone = create_backbone(options.backbone, features)
     describer = create_describer(options.selection, features, options.backbone.device)
@@ -91,6 +89,8 @@ def reconstruct(
         shots, refused = read_photographs(photos, options.intake, leave_out=out)
         shots = _with_positions(shots, options)
         check_crs(dict(enumerate(shots)), options.georeference)
+        if options.export.boundary is not None:  # a wrong one is told before the work, not after it
+            require_boundary_near(Path(options.export.boundary), shots)
     work = _fresh_work_folder(out)
     engine = Engine(
         work,
@@ -147,6 +147,8 @@ def export_again(
     placed_anew = _with_positions([shot for _, shot in sorted(outcome.shots.items())], options)
     outcome = replace(outcome, shots=dict(zip(sorted(outcome.shots), placed_anew, strict=True)))
     check_crs(outcome.shots, options.georeference)
+    if options.export.boundary is not None:
+        require_boundary_near(Path(options.export.boundary), list(outcome.shots.values()))
     out.mkdir(parents=True, exist_ok=True)
     remove_products(out)
     return _finish(out, out / "work", state, store, outcome, options, stopwatch, progress, None)
