@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
 from onthefly3r.errors import ReferenceFormatError
-from onthefly3r.evaluate import clouds, surface
+from onthefly3r.evaluate import clouds, las_file, surface
 from onthefly3r.evaluate.clouds import CloudFile, open_cloud
 from onthefly3r.evaluate.surface import ground_difference, surface_errors
 from onthefly3r.geometry.transforms import Sim3, rotation_exp
@@ -138,6 +138,7 @@ def write_ply(path: Path, points: np.ndarray, form: str) -> None:
 @pytest.mark.parametrize("name", ["c.las", "c.laz", "ascii.ply", "binary_little_endian.ply", "binary_big_endian.ply"])
 def test_cloud_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setattr(clouds, "CHUNK_POINTS", 64)
+    monkeypatch.setattr(las_file, "CHUNK_POINTS", 64)
     points = np.round(np.random.default_rng(0).uniform(0, 100, (150, 3)), 3) + np.floor(ORIGIN / 1e6) * 1e6
     if name.endswith("ply"):
         write_ply(tmp_path / name, points, Path(name).stem)

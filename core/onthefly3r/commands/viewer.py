@@ -28,7 +28,7 @@ def view_cloud(path: Path) -> None:
     import laspy
 
     try:
-        with laspy.open(path) as reader:
+        with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
             # An even step through the file keeps the whole area in sight.
             cloud = reader.read().points[:: 1 + reader.header.point_count // MOST_POINTS]
     except laspy.errors.LaspyException as error:

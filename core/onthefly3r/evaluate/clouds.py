@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..errors import ReferenceFormatError
 from ..geometry.arrays import Float
+from .las_file import open_las
 
 CHUNK_POINTS = 1_000_000
 MAX_HEADER_LINES = 1_000
@@ -32,6 +34,9 @@ class CloudFile:
     path: Path
     n_points: int
     chunks: Callable[[], Iterator[Float]]  # each (N, 3) float64
+    crs: Any = None  # pyproj.CRS that the file states
+    bounds: Float | None = None  # (2, 3) lowest and highest coordinates that the header states
+    single_precision: bool = False  # coordinates are stored as float32
 
 
 def open_cloud(path: Path) -> CloudFile:
@@ -49,7 +54,8 @@ def open_cloud(path: Path) -> CloudFile:
         raise ReferenceFormatError(f"{path}: no such file")
     suffix = path.suffix.lower()
     if suffix in (".las", ".laz"):
-        cloud = _open_las(path)
+        las = open_las(path)
+        cloud = CloudFile(path, las.n_points, las.chunks, las.crs, las.bounds)
     elif suffix == ".ply":
         cloud = _open_ply(path)
     else:
@@ -59,22 +65,12 @@ def open_cloud(path: Path) -> CloudFile:
     return cloud
 
 
-def _open_las(path: Path) -> CloudFile:
-    import laspy
-
-    def chunks() -> Iterator[Float]:
-        try:
-            with laspy.open(path) as reader:
-                for chunk in reader.chunk_iterator(CHUNK_POINTS):
-                    yield np.stack([np.asarray(chunk.x), np.asarray(chunk.y), np.asarray(chunk.z)], axis=1)
-        except (laspy.LaspyException, ValueError, RuntimeError) as error:
-            raise ReferenceFormatError(f"{path}: damaged LAS or LAZ file ({error})") from None
-
-    try:
-        with laspy.open(path) as reader:
-            return CloudFile(path, int(reader.header.point_count), chunks)
-    except (laspy.LaspyException, ValueError, RuntimeError) as error:
-        raise ReferenceFormatError(f"{path}: not a LAS or LAZ file ({error})") from None
+def bounds_of(cloud: CloudFile) -> Float:
+    """Return the lowest and highest coordinates (2, 3), from the header or from all points."""
+    if cloud.bounds is not None:
+        return cloud.bounds
+    boxes = [np.stack([chunk.min(axis=0), chunk.max(axis=0)]) for chunk in cloud.chunks() if len(chunk)]
+    return np.stack([np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)])
 
 
 @dataclass(frozen=True)
@@ -94,7 +90,8 @@ def _open_ply(path: Path) -> CloudFile:
         else:
             yield from _binary_vertices(path, header)
 
-    return CloudFile(path, header.n_vertices, chunks)
+    kinds = dict(header.properties)
+    return CloudFile(path, header.n_vertices, chunks, single_precision="f4" in {kinds[axis] for axis in "xyz"})
 
 
 def _ply_header(path: Path) -> _PlyHeader:
@@ -129,6 +126,9 @@ def _ply_header(path: Path) -> _PlyHeader:
     names = [name for name, _ in properties]
     if any(axis not in names for axis in "xyz") or len(set(names)) < len(names):
         raise ReferenceFormatError(f"{path}: vertices need one property each of x, y and z; found {', '.join(names)}")
+    least = sum(np.dtype(kind).itemsize for _, kind in properties) if form != "ascii" else 2 * len(properties)
+    if n_vertices * least > path.stat().st_size - offset + 1:  # the last line may lack its end
+        raise ReferenceFormatError(f"{path}: ends before its {n_vertices} vertices")
     return _PlyHeader(offset, form, n_vertices, tuple(properties))
 
 

@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..geometry.transforms import Sim3
 from .clouds import open_cloud
 from .readers import read_poses, scene_depth
+from .same_frame import in_frame_of
 from .surface import GroundDifference, SurfaceErrors, ground_difference, surface_errors
 from .trajectory_errors import Align, PoseErrors, pose_errors
 
@@ -30,6 +31,7 @@ class EvaluationReport:
     surface: SurfaceErrors | None = None
     ground: GroundDifference | None = None
     icp_from_result: Sim3 | None = None  # refinement before the clouds were compared
+    notes: tuple[str, ...] = ()  # what a reader must know about the comparison
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON values."""
@@ -57,6 +59,7 @@ class EvaluationReport:
                 "n_cells": ground.n_cells,
                 "cell_m": ground.cell,
             },
+            "notes": list(self.notes),
             "icp": None if self.icp_from_result is None else self.icp_from_result.matrix().tolist(),
         }
 
@@ -95,7 +98,8 @@ def evaluate(
         reference_cloud: .las, .laz or .ply, or an output folder.
         align: fitted to the camera centres before poses are compared.
         common_with: further results; pose errors over the images that all hold are added.
-        cloud_align: `none` compares clouds as they lie (same CRS), `poses` moves the result by the fit of the cameras.
+        cloud_align: `none` compares clouds as they lie, after a transformation where they state different coordinate
+            systems or height references; `poses` moves the result by the fit of the cameras.
         icp: refines that by rigid ICP (needs open3d) before clouds are compared.
         ground_cell_m: also compares heights over a horizontal grid of this cell.
 
@@ -107,6 +111,7 @@ def evaluate(
     if cloud_align == "poses" and reference_poses is None:
         raise InputError("aligning the cloud by the cameras needs reference poses")
     poses = common = depth = surface = ground = refinement = None
+    notes: tuple[str, ...] = ()
     if reference_poses is not None:
         found, reference = read_poses(result), read_poses(reference_poses)
         poses, depth = pose_errors(found, reference, align), scene_depth(reference_poses)
@@ -114,7 +119,11 @@ def evaluate(
             common = pose_errors(found, reference, align, [read_poses(path) for path in common_with])
     if reference_cloud is not None:
         cloud, reference_points = open_cloud(result), open_cloud(reference_cloud)
-        move = poses.reference_from_estimate if cloud_align == "poses" and poses else Sim3()
+        if cloud_align == "poses" and poses:
+            move = poses.reference_from_estimate
+        else:
+            move = Sim3()
+            reference_points, notes = in_frame_of(cloud, reference_points)
         if icp:
             from .icp import refine
 
@@ -123,7 +132,7 @@ def evaluate(
         surface = surface_errors(cloud, reference_points, move)
         if ground_cell_m is not None:
             ground = ground_difference(cloud, reference_points, ground_cell_m, move)
-    return EvaluationReport(result, poses, common, depth, _images_given(result), surface, ground, refinement)
+    return EvaluationReport(result, poses, common, depth, _images_given(result), surface, ground, refinement, notes)
 
 
 def format_table(report: EvaluationReport) -> str:
@@ -144,6 +153,7 @@ def format_table(report: EvaluationReport) -> str:
     if ground is not None:
         note = f"NMAD {ground['nmad_m']:.3f}, {ground['n_cells']:,} cells of {ground['cell_m']:g}"
         lines.append(_line("height", f"{ground['difference_m']:+.3f}", note))
+    lines += [f"note: {note}" for note in report.notes]
     return "\n".join(lines)
 
 
