@@ -91,7 +91,6 @@ def _transformed(cloud: CloudFile, source: _Frame, target: _Frame, result: Cloud
 def _move(source: _Frame, target: _Frame, open_height: bool, cloud: CloudFile) -> Move:
     """Return the transformation of points (N, 3)."""
     from pyproj import CRS, Transformer
-    from pyproj.crs import CompoundCRS
     from pyproj.exceptions import CRSError, ProjError
 
     refused = ReferenceFormatError(
@@ -100,13 +99,7 @@ def _move(source: _Frame, target: _Frame, open_height: bool, cloud: CloudFile) -
     )
     try:
         if "other" in (source.vertical, target.vertical) and not open_height:
-            whole = [
-                CompoundCRS(f"{f.horizontal.name} + {f.name}", [f.horizontal, f.vertical_crs])
-                if f.vertical_crs is not None
-                else f.horizontal.to_3d()
-                for f in (source, target)
-            ]
-            through = Transformer.from_crs(*whole, always_xy=True, allow_ballpark=False)
+            through = Transformer.from_crs(_whole(source), _whole(target), always_xy=True, allow_ballpark=False)
 
             def directly(points: Float) -> Float:
                 return _finite(np.stack(through.transform(*points.T), axis=-1), refused)
@@ -127,6 +120,15 @@ def _move(source: _Frame, target: _Frame, open_height: bool, cloud: CloudFile) -
         return _finite(np.stack([*from_geographic.transform(lon, lat), height], axis=-1), refused)
 
     return by_ellipsoid
+
+
+def _whole(frame: _Frame) -> Any:
+    """Return the CRS of places and heights together."""
+    from pyproj.crs import CompoundCRS
+
+    if frame.vertical_crs is None:
+        return frame.horizontal.to_3d()
+    return CompoundCRS(frame.name, [frame.horizontal, frame.vertical_crs])
 
 
 def _finite(points: Float, refused: ReferenceFormatError) -> Float:
