@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "core" / "onthefly3r"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 HEAVY = {"PIL", "cv2", "embreex", "gtsam", "laspy", "matplotlib", "open3d", "pycolmap", "pyproj", "rasterio"}
-HEAVY |= {"scipy", "shapefile", "torch", "trimesh"}
+HEAVY |= {"pillow_heif", "rawpy", "scipy", "shapefile", "torch", "trimesh"}
 
 # A module imports only from layers above its own; modules of one sub-package may import each other.
 FOUNDATION = {"errors", "options", "option_fields", "protocol", "geometry", "stopwatch", "files"}
@@ -165,7 +165,7 @@ def test_doctor_knows_every_requirement() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     wanted = {(name_of(line), "") for line in project["dependencies"]}
-    wanted |= {(name_of(line), extra) for extra in ("neural", "cloud") for line in extras[extra]}
+    wanted |= {(name_of(line), extra) for extra in ("neural", "cloud", "heic", "raw") for line in extras[extra]}
     known = {(package.distribution, package.extra) for package in PACKAGES}
     assert known == {(name.removesuffix("-cpu"), extra) for name, extra in wanted}
 

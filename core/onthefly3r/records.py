@@ -58,6 +58,10 @@ class Shot:
     gps: GpsFix | None = None
     attitude: Attitude | None = None
     above_takeoff_m: float | None = None  # flying height that the drone states
+    deep: bool = False  # more than 8 bits per channel
+    value_range: tuple[float, float] | None = None  # of the flight's deep pixels: what becomes black and white
+    stamp: tuple[int, int] | None = None  # size in bytes and time of change (ns) of the file when its tags were read
+    positions_from_file: bool = False  # `gps` and `attitude` are a position file's
     warnings: tuple[str, ...] = ()
 
     @property

@@ -26,10 +26,9 @@ from ..geometry.camera import Camera
 from ..geometry.frames import enu_from_cam_rotation
 from ..geometry.geodesy import WorldFrame, utm_crs_for
 from ..geometry.transforms import Rigid3
-from ..intake.folder import read_photographs
 from ..intake.images import load_working_image
-from ..intake.positions_file import read_positions, with_positions
 from ..intake.quality import Quality, measure_quality
+from ..intake.reading import read_flight
 from ..options import Options
 from ..products.clip import in_ring
 from ..products.footprints import Footprint, footprint, with_overlap
@@ -131,9 +130,8 @@ def check_photographs(
     Raises `InputError` when the folder or an option is wrong.
     """
     options = options or Options()
-    shots, refused = read_photographs(Path(photos), options.intake)
-    if options.georeference.positions is not None:
-        shots = with_positions(shots, read_positions(Path(options.georeference.positions)))
+    flight = read_flight(Path(photos), options)
+    shots, refused = flight.shots, flight.refused
     measured = _measure(shots, options, progress, cancel)
     positions = usable_positions(range(len(shots)), dict(enumerate(shots)), options.georeference)
     crs, world = _projected(positions, options)
@@ -151,7 +149,11 @@ def check_photographs(
         photographs=tuple(rows),
         crs=crs,
         vertical=positions.vertical,
-        warnings=(*positions.warnings, *_flight_warnings(rows, shots, refused, positions, measured_m)),
+        warnings=(
+            *flight.warnings,
+            *positions.warnings,
+            *_flight_warnings(rows, shots, refused, positions, measured_m),
+        ),
         time_s=estimated_time_s(usable, options),
         memory_mib=estimated_memory_mib(len(usable), options),
     )

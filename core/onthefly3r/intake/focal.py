@@ -12,6 +12,11 @@ from .tags import Tags
 FILM_DIAGONAL_MM = 43.27  # of the 36 x 24 mm frame that 35-mm equivalents refer to (CIPA DCG-001)
 GUESS_RATIO, GUESS_SIGMA = 0.85, 0.30
 SENSOR_SIGMA, EQUIVALENT_SIGMA = 0.05, 0.07
+# What lenses of drones and hand-held cameras have: tags outside were never measured (65535 stands for "unknown").
+LEAST_EQUIVALENT_MM, MOST_EQUIVALENT_MM = 5.0, 2_000.0
+LEAST_FOCAL_MM, MOST_FOCAL_MM = 0.5, 1_200.0
+MOST_DIGITAL_ZOOM = 50.0
+LEAST_RATIO, MOST_RATIO = 0.1, 60.0  # focal length over longest side
 WIDE_ASPECT = 1.6  # beyond this a photograph is taken for a crop of a 4:3 sensor that kept its full width
 
 
@@ -33,15 +38,15 @@ def focal_prior(tags: Tags, width_px: int, height_px: int, focal_35mm: float | N
     aspect = longest / shortest
     if focal_35mm is not None:
         return FocalPrior(_equivalent_ratio(focal_35mm, aspect), SENSOR_SIGMA, "option")
-    equivalent_mm = tags.number("FocalLengthIn35mmFilm")
-    equivalent = _equivalent_ratio(equivalent_mm, aspect) if equivalent_mm and equivalent_mm > 5.0 else None
-    focal_mm = tags.number("FocalLength")
-    if focal_mm and focal_mm > 0.5:
-        zoom = tags.number("DigitalZoomRatio")
-        zoom = zoom if zoom and 1.0 < zoom < 50.0 else 1.0
+    equivalent_mm = tags.number("FocalLengthIn35mmFilm", LEAST_EQUIVALENT_MM, MOST_EQUIVALENT_MM)
+    equivalent = _equivalent_ratio(equivalent_mm, aspect) if equivalent_mm else None
+    focal_mm = tags.number("FocalLength", LEAST_FOCAL_MM, MOST_FOCAL_MM)
+    if focal_mm:
+        zoom = tags.number("DigitalZoomRatio", 1.0, MOST_DIGITAL_ZOOM) or 1.0
         sensor = sensor_size_mm(tags.text("Make"), tags.text("Model"))
-        if sensor is not None:
-            return FocalPrior(focal_mm * zoom / _used_width_mm(sensor, aspect), SENSOR_SIGMA, "exif+sensor")
+        ratio = None if sensor is None else focal_mm * zoom / _used_width_mm(sensor, aspect)
+        if ratio is not None and LEAST_RATIO <= ratio <= MOST_RATIO:
+            return FocalPrior(ratio, SENSOR_SIGMA, "exif+sensor")
         ratio = _focal_plane_ratio(tags, focal_mm)
         # The resolution tag counts original pixels; where ExifImageWidth was rewritten by a resize it misleads.
         if ratio is not None and (equivalent is None or abs(ratio / equivalent - 1.0) < 0.2):
@@ -84,10 +89,11 @@ def _equivalent_ratio(equivalent_mm: float, aspect: float) -> float:
 
 
 def _focal_plane_ratio(tags: Tags, focal_mm: float) -> float | None:
-    resolution = tags.number("FocalPlaneXResolution")
-    unit_mm = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(int(tags.number("FocalPlaneResolutionUnit") or 2), 25.4)
-    width = max(tags.number("ExifImageWidth") or 0.0, tags.number("ExifImageHeight") or 0.0)
-    if not resolution or resolution <= 0.0 or width <= 0.0:
+    resolution = tags.number("FocalPlaneXResolution", 1e-3, 1e8)
+    unit_mm = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0, 5.0: 0.001}.get(tags.number("FocalPlaneResolutionUnit") or 2.0, 25.4)
+    width = max(tags.number("ExifImageWidth", 1.0, 1e6) or 0.0, tags.number("ExifImageHeight", 1.0, 1e6) or 0.0)
+    if not resolution or not width:
         return None
     sensor_mm = width / resolution * unit_mm
-    return focal_mm / sensor_mm if 3.5 <= sensor_mm <= 60.0 else None
+    ratio = focal_mm / sensor_mm if 3.5 <= sensor_mm <= 60.0 else 0.0
+    return ratio if LEAST_RATIO <= ratio <= MOST_RATIO else None

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+from .xmp import parse_xmp
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
 EXIF_IFD, GPS_IFD = 0x8769, 0x8825
-MAX_XMP_BYTES = 1 << 20
+MAX_TEXT = 100  # characters of a name of maker, model or lens that are kept
+XMP_SEGMENTS = (b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0")
+_FRACTION = re.compile(r"([+-]?\d{1,20})/(\d{1,20})")
 
 
 @dataclass(frozen=True)
 class Tags:
-    """What the header says, by tag name; `xmp` is keyed by local name without namespace."""
+    """What the header says, by tag name; `xmp` is keyed by `prefix:name` with the usual prefixes (`xmp.py`)."""
 
     exif: Mapping[str, Any] = field(default_factory=dict)  # main and Exif IFD
     gps: Mapping[str, Any] = field(default_factory=dict)
@@ -27,32 +32,51 @@ class Tags:
         """Return an EXIF text without padding and control characters, "" when missing."""
         value = self.exif.get(name, "")
         if isinstance(value, bytes):
-            value = value.decode("utf-8", "replace")
-        text = str(value).split("\0", 1)[0]
-        return " ".join("".join(c for c in text if c.isprintable()).split())
+            value = value[: 4 * MAX_TEXT].decode("utf-8", "replace")
+        if not isinstance(value, str | int | float):
+            return ""
+        text = str(value)[: 4 * MAX_TEXT].split("\0", 1)[0]
+        return " ".join("".join(c for c in text if c.isprintable()).split())[:MAX_TEXT]
 
-    def number(self, name: str) -> float | None:
-        """Return an EXIF number, None when missing, not finite or no number."""
-        return finite(self.exif.get(name))
+    def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float | None:
+        """Return an EXIF number, None when missing, no finite number or outside `low`..`high`."""
+        return within(self.exif.get(name), low, high)
 
-    def xmp_number(self, *names: str) -> float | None:
-        """Return the first of these XMP numbers that is there and finite."""
+    def xmp_number(self, *names: str, low: float = -math.inf, high: float = math.inf) -> float | None:
+        """Return the first of these XMP numbers that is there, finite and within bounds; fractions count."""
         for name in names:
-            value = finite(self.xmp.get(name))
+            value = within(self.xmp.get(name), low, high)
             if value is not None:
                 return value
         return None
 
+    def xmp_text(self, *names: str) -> str:
+        """Return the first of these XMP texts that is there, "" when none is."""
+        return next((self.xmp[name] for name in names if self.xmp.get(name)), "")
+
 
 def finite(value: Any) -> float | None:
-    """Return a tag's value as a finite float; None for missing, 0/0, NaN and text."""
+    """Return a tag's value as a finite float; None for missing, 0/0, NaN and text. Texts may be fractions."""
     if isinstance(value, tuple | list) and len(value) == 1:
         value = value[0]
+    if isinstance(value, bool | complex):
+        return None
+    if isinstance(value, str):
+        fraction = _FRACTION.fullmatch(value.strip()) if "/" in value else None
+        if fraction:
+            above, below = int(fraction[1]), int(fraction[2])
+            return above / below if below else None
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
     return number if math.isfinite(number) else None
+
+
+def within(value: Any, low: float, high: float) -> float | None:
+    """Return a tag's value as a float, None where it is none or outside `low`..`high`."""
+    number = finite(value)
+    return number if number is not None and low <= number <= high else None
 
 
 def read_tags(image: Image) -> Tags:
@@ -62,45 +86,25 @@ def read_tags(image: Image) -> Tags:
     gps: dict[str, Any] = {}
     try:
         exif, gps = _read_exif(image)
+    except MemoryError:
+        raise
     except Exception as error:  # Pillow's EXIF parser fails in many ways on damaged blocks
         warnings.append(f"EXIF cannot be read ({type(error).__name__})")
-    packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
-    xmp: dict[str, str] = {}
-    try:
-        xmp = parse_xmp(packet.encode() if isinstance(packet, str) else bytes(packet))
-    except ValueError as error:
-        warnings.append(f"XMP left out: {error}")
-    return Tags(exif, gps, xmp, tuple(warnings))
+    return Tags(exif, gps, parse_xmp(_packets(image)), tuple(warnings))
 
 
-def parse_xmp(packet: bytes) -> dict[str, str]:
-    """Return {local name: value} of an XMP packet's attributes and text elements; the first of a name counts.
-
-    Raises `ValueError` when the packet is larger than 1 MiB, no XML, or uses entities or a DTD.
-    """
-    from defusedxml import ElementTree
-    from defusedxml.common import DefusedXmlException
-
-    if len(packet) > MAX_XMP_BYTES:
-        raise ValueError(f"{len(packet)} bytes")
-    packet = packet.strip(b"\0 \r\n\t")
-    if not packet:
-        return {}
-    try:
-        root = ElementTree.fromstring(packet, forbid_dtd=True)
-    except (ElementTree.ParseError, DefusedXmlException, UnicodeError, LookupError) as error:
-        raise ValueError(f"not well-formed ({type(error).__name__})") from error
-    values: dict[str, str] = {}
-    for element in root.iter():
-        for key, value in element.attrib.items():
-            values.setdefault(_local(key), value.strip())
-        if len(element) == 0 and element.text and element.text.strip():
-            values.setdefault(_local(element.tag), element.text.strip())
-    return values
-
-
-def _local(name: str) -> str:
-    return name.rsplit("}", 1)[-1].rsplit(":", 1)[-1]
+def _packets(image: Image) -> list[bytes]:
+    """Return all XMP packets of a file, in their order; a JPEG may hold several."""
+    packets = [
+        segment[len(mark) :]
+        for name, segment in getattr(image, "applist", ())
+        for mark in XMP_SEGMENTS
+        if name == "APP1" and segment.startswith(mark)
+    ]
+    other = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+    if isinstance(other, str):
+        other = other.encode("utf-8", "replace")
+    return packets or ([bytes(other)] if isinstance(other, bytes | bytearray) else [])
 
 
 def _read_exif(image: Image) -> tuple[dict[str, Any], dict[str, Any]]:

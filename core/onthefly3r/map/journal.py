@@ -129,4 +129,6 @@ def shot_from_json(value: Any) -> Shot:
     gps, attitude = known.pop("gps"), known.pop("attitude")
     known["path"] = Path(known["path"])
     known["warnings"] = tuple(known["warnings"])
+    for name in ("value_range", "stamp"):
+        known[name] = tuple(known[name]) if known.get(name) else None
     return Shot(**known, gps=GpsFix(**gps) if gps else None, attitude=Attitude(**attitude) if attitude else None)

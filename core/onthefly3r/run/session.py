@@ -17,9 +17,9 @@ from ..engine.loop import Engine
 from ..errors import InputError, ReconstructionError
 from ..features.extraction import FeatureStore
 from ..files.atomic import write_text
-from ..intake.folder import read_photographs
 from ..intake.images import load_working_image
 from ..intake.positions_file import read_positions, with_positions
+from ..intake.reading import read_flight
 from ..map.journal import shot_from_json, shot_to_json
 from ..map.state import MapState
 from ..map.store import Store
@@ -86,8 +86,8 @@ def reconstruct(
     backbone = create_backbone(options.backbone, features)
     describer = create_describer(options.selection, features, options.backbone.device)
     with stopwatch.stage("intake"):
-        shots, refused = read_photographs(photos, options.intake, leave_out=out)
-        shots = _with_positions(shots, options)
+        flight = read_flight(photos, options, leave_out=out)
+        shots, refused = flight.shots, flight.refused
         check_crs(dict(enumerate(shots)), options.georeference)
         if options.export.boundary is not None:  # a wrong one is told before the work, not after it
             require_boundary_near(Path(options.export.boundary), shots)
@@ -97,11 +97,12 @@ def reconstruct(
         options,
         backbone,
         describer,
-        lambda shot: load_working_image(shot, options.backbone.working_px),
+        lambda shot: load_working_image(shot, options.backbone.working_px, engine.warnings.append),
         progress,
         cancel,
     )
     engine.stopwatch = stopwatch
+    engine.warnings += flight.warnings
     with single_threaded_blas():
         engine.add_all(shots)
         engine.finish()
@@ -144,8 +145,11 @@ def export_again(
     store = Store(run / "work")
     state = MapState.load(store)
     outcome = _read_run(run / "work" / "run.json")
-    placed_anew = _with_positions([shot for _, shot in sorted(outcome.shots.items())], options)
-    outcome = replace(outcome, shots=dict(zip(sorted(outcome.shots), placed_anew, strict=True)))
+    if options.georeference.positions is not None:
+        file = read_positions(Path(options.georeference.positions))
+        placed_anew, told = with_positions([shot for _, shot in sorted(outcome.shots.items())], file)
+        shots = dict(zip(sorted(outcome.shots), placed_anew, strict=True))
+        outcome = replace(outcome, shots=shots, warnings=[*outcome.warnings, *told])
     check_crs(outcome.shots, options.georeference)
     if options.export.boundary is not None:
         require_boundary_near(Path(options.export.boundary), list(outcome.shots.values()))
@@ -260,11 +264,6 @@ def _finish(
         placed=placed,
         given=summary.given,
     )
-
-
-def _with_positions(shots: list[Shot], options: Options) -> list[Shot]:
-    file = options.georeference.positions
-    return shots if file is None else with_positions(shots, read_positions(Path(file)))
 
 
 def _fresh_work_folder(out: Path) -> Path:
