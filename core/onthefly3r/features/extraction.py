@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..files.array_file import ArrayFile
 from ..geometry.arrays import Float, UInt8
 from ..records import Features, WorkingImage
 from .pycolmap_module import load_pycolmap
@@ -118,7 +119,7 @@ class FeatureStore:
         path = self._path(index)
         if not path.exists():
             raise KeyError(index)
-        with np.load(path, allow_pickle=False) as stored:
+        with ArrayFile(path) as stored:
             features = Features(stored["pixels"], stored["scales"], stored["angles"], stored["descriptors"])
         self._remember(index, features)
         return features

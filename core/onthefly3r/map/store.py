@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..files.array_file import ArrayFile
 from ..geometry.arrays import Float, UInt8
 from ..records import CompactReference, NewFrame, Observations, Submap
 from .journal import submap_to_json
@@ -105,7 +106,7 @@ class Store:
         if index in self._recent:
             self._recent.move_to_end(index)
             return self._recent[index]
-        with np.load(self._chunk_path(self._chunk_of[index]), allow_pickle=False) as chunk:
+        with ArrayFile(self._chunk_path(self._chunk_of[index])) as chunk:
             reference = CompactReference(
                 chunk[f"{index}/reference_pixels"],
                 chunk[f"{index}/reference_points"],
@@ -117,7 +118,7 @@ class Store:
     def stream_points(self) -> Iterator[StoredPoints]:
         """Yield the points of all frames, one frame in memory at a time."""
         for index, submap in self._chunk_of.items():
-            with np.load(self._chunk_path(submap), allow_pickle=False) as chunk:
+            with ArrayFile(self._chunk_path(submap)) as chunk:
                 yield StoredPoints(
                     index, submap, chunk[f"{index}/points"], chunk[f"{index}/rgb"], chunk[f"{index}/confidence"]
                 )
@@ -126,7 +127,7 @@ class Store:
         """Yield what the backbone tied together in each submap, by its number; nothing where it does not tell."""
         names = [field.name for field in fields(Observations)]
         for submap in self._submaps:
-            with np.load(self._chunk_path(submap), allow_pickle=False) as chunk:
+            with ArrayFile(self._chunk_path(submap)) as chunk:
                 if f"observations/{names[0]}" in chunk:
                     yield submap, Observations(**{name: chunk[f"observations/{name}"] for name in names})
 
