@@ -59,9 +59,9 @@ class ArrayFile:
             if array.size != int(np.prod(shape, dtype=object)):
                 raise ValueError(f"{name} has {array.size} values instead of those of the shape {shape}")
             return array.reshape(shape, order="F" if column_major else "C")
-        except (KeyError, OSError, ValueError, TypeError, EOFError, OverflowError, RuntimeError) as error:
-            raise self._damaged(error) from None
-        except (NotImplementedError, zipfile.BadZipFile) as error:
+        except MemoryError:
+            raise
+        except Exception as error:  # zip and header, which is a Python literal, know many ways to be damaged
             raise self._damaged(error) from None
 
     def _damaged(self, error: Exception) -> InputError:
