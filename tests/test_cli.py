@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 
 from onthefly3r.commands.cli import app
 from onthefly3r.errors import Cancelled, GeoreferenceError
+from onthefly3r.files.stamp import Stamp
 from onthefly3r.options import Options, iterate_options
 from onthefly3r.protocol import Event, Progress
 
@@ -58,7 +59,7 @@ class FakeEngine:
         progress(Progress("export", 10, 10, placed=9, rejected=1))
         return FakeResult(REPORT, out / "cloud.laz", out / "cameras.shp", out / "report.json", 9, 10)
 
-    def export_again(self, run: Path, out: Path, options: Options, progress: Any) -> FakeResult:
+    def export(self, run: Path, out: Path, options: Options, progress: Any) -> FakeResult:
         return self.reconstruct(run, out, options, progress, lambda: False)
 
 
@@ -67,9 +68,12 @@ def engine(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeEngine]:
     fake = FakeEngine()
     module = types.ModuleType("onthefly3r.run.session")
     module.reconstruct = fake.reconstruct  # type: ignore[attr-defined]
-    module.export_again = fake.export_again  # type: ignore[attr-defined]
-    module.earlier_options = lambda run: {"vertical": "egm96", "spacing_m": 0.25}  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "onthefly3r.run.session", module)
+    again = types.ModuleType("onthefly3r.run.export")
+    again.export = fake.export  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "onthefly3r.run.export", again)
+    earlier = {"vertical": "egm96", "spacing_m": 0.25}
+    monkeypatch.setattr("onthefly3r.run.record.earlier_options", lambda run: earlier)
     yield fake
 
 
@@ -193,7 +197,7 @@ def test_wrong_input_is_told_without_traceback(engine: FakeEngine, tmp_path: Pat
         (GeoreferenceError("only 2 usable positions: name --local"), 3),
         (KeyboardInterrupt(), 130),
         (Cancelled("stopped on request"), 130),
-        (OSError(28, "No space left on device", "cloud.laz"), 2),
+        (OSError(28, "No space left on device", "cloud.laz"), 4),
         (ModuleNotFoundError("No module named 'gtsam'"), 2),
         (MemoryError(), 1),
     ],
@@ -208,15 +212,27 @@ def test_exit_codes(error: BaseException, exit_code: int, engine: FakeEngine, tm
     assert "Traceback" not in shown.output
 
 
-def test_unexpected_error_leaves_a_traceback_in_work(engine: FakeEngine, tmp_path: Path) -> None:
+@pytest.mark.parametrize("ours", [True, False])
+def test_unexpected_error_leaves_a_traceback_in_work_only_where_that_is_ours(
+    ours: bool, engine: FakeEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Elsewhere it goes to the temporary folder, under a name that nobody can plant a link at."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    out = tmp_path / "out"
+    for folder in (out / "work", tmp_path / "temporary"):
+        folder.mkdir(parents=True)
+    (out / "work" / "thesis.txt").write_text("mine", encoding="utf-8")
+    if ours:
+        Stamp(map_open=True).write(out)
     engine.trouble = raise_(ZeroDivisionError("by nothing"))
-    shown = call("run", tmp_path, tmp_path / "out")
-    note = tmp_path / "out" / "work" / "crash.txt"
+    shown = call("run", tmp_path, out)
     assert shown.exit_code == 1
-    assert str(note) in shown.stderr
     assert "by nothing" in shown.stderr
     assert "Traceback" not in shown.output
+    note = out / "work" / "crash.txt" if ours else next((tmp_path / "temporary").iterdir())
+    assert str(note) in shown.stderr
     assert "ZeroDivisionError" in note.read_text(encoding="utf-8")
+    assert (out / "work" / "crash.txt").exists() == ours
 
 
 SLOW_ENGINE = """
@@ -342,15 +358,16 @@ def test_view_says_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_refused_reconstruction_names_its_report(engine: FakeEngine, tmp_path: Path) -> None:
     def refuse() -> None:
-        (tmp_path / "out").mkdir()
-        (tmp_path / "out" / "report.json").touch()
-        raise GeoreferenceError("only 2 usable positions: name --local")
+        error = GeoreferenceError("only 2 usable positions: name --local")
+        error.report, error.way_on = tmp_path / "out" / "report.json", "9 photographs are placed"
+        raise error
 
     engine.trouble = refuse
     shown = call("run", tmp_path, tmp_path / "out")
     assert shown.exit_code == 3
     assert "only 2 usable positions" in shown.stderr
     assert str(tmp_path / "out" / "report.json") in shown.stderr
+    assert "9 photographs are placed" in shown.stderr
 
 
 def test_warnings_of_the_report_are_told_once(

@@ -9,7 +9,7 @@ import pytest
 
 from onthefly3r.errors import InputError
 from onthefly3r.options import Options
-from onthefly3r.run.session import earlier_options
+from onthefly3r.run.record import earlier_options
 
 
 def write(folder: Path, text: str) -> None:

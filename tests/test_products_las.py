@@ -157,13 +157,6 @@ def test_coordinates_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         write_cloud(tmp_path / "cloud.laz", iter([far]), WKT1, 0.001)
 
 
-def test_a_stale_copc_is_removed(tmp_path: Path) -> None:
-    stale = tmp_path / "cloud.copc.laz"
-    stale.write_bytes(b"stale")
-    write_cloud(tmp_path / "cloud.laz", tiles(), WKT1, 0.001)
-    assert not stale.exists()
-
-
 @pytest.mark.parametrize(("spacing_m", "scale_m"), [(5.0, 1e-3), (0.05, 1e-3), (0.01, 1e-3), (0.004, 1e-4)])
 def test_scale_is_a_tenth_of_the_spacing_or_finer(spacing_m: float, scale_m: float) -> None:
     assert las_scale_m(spacing_m) == pytest.approx(scale_m)

@@ -19,7 +19,8 @@ from onthefly3r.evaluate.comparison import evaluate
 from onthefly3r.intake.folder import read_photographs
 from onthefly3r.options import IntakeOptions
 from onthefly3r.protocol import Progress
-from onthefly3r.run.session import Result, export_again
+from onthefly3r.run.export import export
+from onthefly3r.run.result import Result
 from onthefly3r.simulate import SurveyOptions, simulate_survey
 
 FAST = {"dense_px": 200, "threads": 2}
@@ -73,6 +74,8 @@ def test_every_file_is_there_and_no_half_one(case: Case) -> None:
     for name in FILES:
         assert (case.out / name).stat().st_size > 0, name
     assert not [path for path in case.out.rglob("*") if "part" in path.suffixes or path.name.startswith(".")]
+    assert sorted(path.name for path in (case.out / "work").iterdir()) == ["chunks", "journal.jsonl", "run.json"]
+    assert not (case.out / "onthefly3r.lock").exists()
 
 
 def test_report_counts_everything_that_was_given(case: Case) -> None:
@@ -119,7 +122,7 @@ def test_progress_is_told_in_order(case: Case) -> None:
 
 
 def test_export_again_in_another_crs(case: Case, tmp_path: Path) -> None:
-    again = export_again(case.out, tmp_path / "again", Options.from_flat({"crs": "EPSG:3035", "format": "las"}))
+    again = export(case.out, tmp_path / "again", Options.from_flat({"crs": "EPSG:3035", "format": "las"}))
     assert again.report["georeference"]["crs"] == "EPSG:3035"
     assert (tmp_path / "again" / "cloud.las").exists() and not (tmp_path / "again" / "cloud.laz").exists()
     assert again.placed == 12
@@ -130,19 +133,19 @@ def test_without_positions_the_report_says_why_and_local_works(case: Case, tmp_p
     name = sorted(case.photos.glob("*.JPG"))[2].name
     (tmp_path / "geo.txt").write_text(f"EPSG:4326\n{name} 15.0 48.0 300\n", encoding="utf-8")
     with pytest.raises(GeoreferenceError, match="--local"):
-        export_again(case.out, tmp_path / "none", Options.from_flat({"positions": str(tmp_path / "geo.txt")}))
+        export(case.out, tmp_path / "none", Options.from_flat({"positions": str(tmp_path / "geo.txt")}))
     report = json.loads((tmp_path / "none" / "report.json").read_text(encoding="utf-8"))
     assert report["georeference"] is None and "position" in report["error"]
     assert not (tmp_path / "none" / "cloud.laz").exists()
     unknown = {"local": True, "positions": str(tmp_path / "geo.txt")}
-    local = export_again(case.out, tmp_path / "units", Options.from_flat(unknown))
+    local = export(case.out, tmp_path / "units", Options.from_flat(unknown))
     assert local.cloud is not None and local.report["georeference"] is None
     assert any("not metres" in warning for warning in local.report["warnings"])
 
 
 def test_local_coordinates_are_metres_where_positions_tell(case: Case, tmp_path: Path) -> None:
     """The scale is that of twelve positions of 1.5 m (1 sigma) over 90 m."""
-    local = export_again(case.out, tmp_path, Options.from_flat({"local": True}))
+    local = export(case.out, tmp_path, Options.from_flat({"local": True}))
     assert local.report["georeference"] is None and local.report["warnings"] == []
     report = evaluate(tmp_path, case.truth, align="se3")
     assert report.poses is not None and report.poses.ate < 2.0
@@ -159,27 +162,56 @@ def test_a_crs_that_will_not_do_is_told_before_the_work(case: Case, tmp_path: Pa
         with pytest.raises(OptionError, match="crs"):
             reconstruct(case.photos, tmp_path / "out", Options.from_flat({**FAST, "crs": crs}))
         with pytest.raises(OptionError, match="crs"):
-            export_again(case.out, tmp_path / "out", Options.from_flat({"crs": crs}))
+            export(case.out, tmp_path / "out", Options.from_flat({"crs": crs}))
         assert not (tmp_path / "out").exists()
 
 
-def test_nothing_of_an_earlier_result_passes_for_the_next(case: Case, tmp_path: Path) -> None:
-    """An export that fails, and a run that is cancelled, after which the folder serves again."""
-    export_again(case.out, tmp_path, Options())
-    with pytest.raises(ReconstructionError, match="no points"):
-        export_again(case.out, tmp_path, Options.from_flat({"min_confidence": 1.0}))
-    assert not (tmp_path / "cloud.laz").exists() and not (tmp_path / "preview.png").exists()
-    export_again(case.out, tmp_path, Options())
+def listing(folder: Path) -> dict[str, bytes]:
+    """What a user finds in a folder, but for the stamp, which changes."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and path.name != "onthefly3r.json"
+    }
+
+
+def test_what_fails_or_is_cancelled_leaves_the_earlier_result_as_it_was(case: Case, tmp_path: Path) -> None:
+    """An export that fails, and runs that are cancelled; the report of the failure lies beside."""
+    out = tmp_path / "out"
+    shutil.copytree(case.out, out)
+    before = listing(out)
+    assert "work/journal.jsonl" in before and "cloud.laz" in before
+    with pytest.raises(ReconstructionError, match="no points") as failed:
+        export(case.out, out, Options.from_flat({"min_confidence": 1.0}))
+    assert failed.value.report == out / "failed-report.json"
+    assert "no points" in json.loads(failed.value.report.read_text(encoding="utf-8"))["error"]
     for _ in range(2):
         with pytest.raises(Cancelled):
-            reconstruct(case.photos, tmp_path, Options.from_flat(FAST), cancel=Later(2))
-        assert not [path.name for path in tmp_path.iterdir() if path.is_file()]
-        assert (tmp_path / "work" / "features").exists()
+            reconstruct(case.photos, out, Options.from_flat(FAST), cancel=Later(2))
+    after = listing(out)
+    assert {name: after[name] for name in before} == before
+    assert all(name.startswith(("failed-report.", "work/attempt-")) for name in set(after) - set(before))
+    export(case.out, out, Options())
+    assert not (out / "failed-report.json").exists()
+
+
+def test_a_map_that_cannot_be_georeferenced_stays_beside_the_earlier_result(case: Case, tmp_path: Path) -> None:
+    """The new map is named, and a local export writes it."""
+    out = tmp_path / "out"
+    shutil.copytree(case.out, out)
+    before = listing(out)
+    (tmp_path / "geo.txt").write_text("EPSG:4326\nnobody.JPG 15.0 48.0 300\n", encoding="utf-8")
+    few = Options.from_flat({**FAST, "dense_px": 64, "positions": str(tmp_path / "geo.txt")})
+    with pytest.raises(GeoreferenceError) as failed:
+        reconstruct(case.photos, out, few)
+    home = Path(str(failed.value.way_on).split("export ")[1].split(" NEW-FOLDER")[0])
+    assert {name: held for name, held in listing(out).items() if name in before} == before
+    assert export(home, tmp_path / "local", Options.from_flat({"local": True})).placed == 12
 
 
 def test_results_among_the_photographs_are_no_photographs(case: Case) -> None:
     out = case.photos / "result"
-    export_again(case.out, out, Options())
+    export(case.out, out, Options())
     assert (out / "preview.png").exists()
     shots, refused = read_photographs(case.photos, IntakeOptions(), leave_out=out)
     assert len(shots) + len(refused) == 14  # as without the results

@@ -10,12 +10,13 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from .engine.loop import Engine
     from .options import Options
-    from .run.session import Result, reconstruct
+    from .run.result import Result
+    from .run.session import reconstruct
 
 __all__ = ["Engine", "Options", "Result", "__version__", "reconstruct"]
 
 
-_HOMES = {"Engine": "engine.loop", "Options": "options", "Result": "run.session", "reconstruct": "run.session"}
+_HOMES = {"Engine": "engine.loop", "Options": "options", "Result": "run.result", "reconstruct": "run.session"}
 
 
 def __getattr__(name: str) -> Any:

@@ -5,9 +5,11 @@
     │   ├── OptionError          an option's name or value
     │   ├── PhotographError      one photograph cannot be used (reported, never fatal for the others)
     │   ├── ReferenceFormatError a reference model, trajectory, cloud or position file
+    │   ├── BusyError            another process works in the output folder
     │   └── MissingDependencyError the interpreter lacks a package or a system library
     ├── ReconstructionError      nothing could be reconstructed (exit 3, the report is still written)
     │   └── GeoreferenceError    the map cannot be tied to the Earth (exit 3, the report is still written)
+    ├── StorageError             no room on the disk or no access to a file (exit 4)
     └── Cancelled                the caller asked to stop (exit 130)
 
 A local model that does not fit the map is no exception: see `records.Rejection`.
@@ -15,11 +17,14 @@ A local model that does not fit the map is no exception: see `records.Rejection`
 
 from __future__ import annotations
 
+from pathlib import Path
+
 
 class OnTheFly3RError(Exception):
     """Anything this package raises on purpose."""
 
     exit_code = 1
+    way_on = ""  # what can be done with what is there
 
 
 class InputError(OnTheFly3RError):
@@ -45,6 +50,10 @@ class ReferenceFormatError(InputError):
     """A reference model, trajectory, cloud or position file cannot be read."""
 
 
+class BusyError(InputError):
+    """Another process works in the output folder; the message names it."""
+
+
 class MissingDependencyError(InputError):
     """The interpreter lacks a package or a system library that the request needs."""
 
@@ -53,10 +62,17 @@ class ReconstructionError(OnTheFly3RError):
     """Nothing could be reconstructed from the photographs."""
 
     exit_code = 3
+    report: Path | None = None  # that says more
 
 
 class GeoreferenceError(ReconstructionError):
     """The map cannot be tied to the Earth with the positions at hand."""
+
+
+class StorageError(OnTheFly3RError):
+    """There is no room on the disk or no access to a file; what was there before is as it was."""
+
+    exit_code = 4
 
 
 class Cancelled(OnTheFly3RError):

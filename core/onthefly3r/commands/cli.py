@@ -22,7 +22,7 @@ from .console import columns, session, use_utf8
 from .option_parameters import given, run_options, with_options_of, with_run_options
 
 if TYPE_CHECKING:
-    from ..run.session import Result
+    from ..run.result import Result
     from .demo import Demo
 
 app = typer.Typer(
@@ -147,10 +147,11 @@ def export(
     """Write the files of an earlier run again into OUT; what is not named stays as it was in that run."""
     with session(json_lines=json, out=out) as here:
         _require_folder(result, "RESULT")
-        from ..run.session import earlier_options, export_again
+        from ..run.export import export as export_run
+        from ..run.record import earlier_options
 
         options = run_options(over_earlier(earlier_options(result), given(values)))
-        again = export_again(result, out, options, here.progress)
+        again = export_run(result, out, options, here.progress)
         here.reporter.result(_result_data(again), columns(_result_summary(again)))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import logging
 import os
 import signal
@@ -21,10 +20,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from .. import protocol
-from ..errors import Cancelled, MissingDependencyError, OnTheFly3RError, ReconstructionError
-
-# Failures of the disk or of permissions: the user can mend them, a traceback would not help.
-_DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG)
+from ..errors import Cancelled, MissingDependencyError, OnTheFly3RError, ReconstructionError, StorageError
+from ..files.atomic import write_text
+from ..files.room import is_storage_trouble, storage_error
+from ..files.stamp import CRASH_NOTE, WORK, holds_map
 
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name)]
 
@@ -182,26 +181,35 @@ def session(*, json_lines: bool, out: Path | None = None, polite: bool = True) -
             try:
                 yield here
                 return
-            except OnTheFly3RError as error:
-                message, exit_code = str(error), error.exit_code
-                if isinstance(error, ReconstructionError) and out and (out / "report.json").is_file():
-                    message += f"; the report is in {out / 'report.json'}"
-            except (KeyboardInterrupt, BrokenPipeError):
-                message, exit_code = "stopped on request", Cancelled.exit_code
-            except MemoryError:
-                message, exit_code = "not enough memory: lower --working-px or --dense-px, or close other programs", 1
-            except ImportError as error:
-                message = f"{error}: the command 'onthefly3r doctor' says what is missing and how to install it"
-                exit_code = MissingDependencyError.exit_code
-            except Exception as error:
-                if isinstance(error, OSError) and error.errno in _DISK_TROUBLE:
-                    message, exit_code = f"{error.strerror}: {error.filename or out}", 2
-                else:
-                    message = f"unexpected {type(error).__name__}: {error}; the traceback is in {_note_crash(out)}"
-                    exit_code = 1
+            except BaseException as error:
+                message, exit_code = _explain(error, out)
         with contextlib.suppress(BrokenPipeError):
             reporter.error(message, exit_code)
     raise typer.Exit(exit_code)
+
+
+def _explain(error: BaseException, out: Path | None) -> tuple[str, int]:
+    """Return what to say of an error, and the exit code; raises what is no error."""
+    if isinstance(error, OnTheFly3RError):
+        message, exit_code = str(error), error.exit_code
+        if isinstance(error, ReconstructionError) and error.report is not None:
+            message += f"; the report is in {error.report}"
+    elif isinstance(error, (KeyboardInterrupt, BrokenPipeError)):
+        message, exit_code = "stopped on request", Cancelled.exit_code
+    elif isinstance(error, MemoryError):
+        message, exit_code = "not enough memory: lower --working-px or --dense-px, or close other programs", 1
+    elif isinstance(error, ImportError):
+        message = f"{error}: the command 'onthefly3r doctor' says what is missing and how to install it"
+        exit_code = MissingDependencyError.exit_code
+    elif isinstance(error, OSError) and is_storage_trouble(error):
+        message, exit_code = str(storage_error(error, out)), StorageError.exit_code
+    elif isinstance(error, Exception):
+        message = f"unexpected {type(error).__name__}: {error}; the traceback is in {_note_crash(error, out)}"
+        exit_code = 1
+    else:
+        raise error
+    way_on = getattr(error, "way_on", "")
+    return f"{message}; {way_on}" if way_on else message, exit_code
 
 
 @contextlib.contextmanager
@@ -232,16 +240,19 @@ def _warnings_to(here: Session) -> Iterator[None]:
         logger.removeHandler(handler)
 
 
-def _note_crash(folder: Path | None) -> Path:
-    """Save the traceback in `folder`/work, or in the temporary folder where that cannot be written."""
-    text = traceback.format_exc()
-    for place in (folder / "work" if folder else None, Path(tempfile.gettempdir())):
+def _note_crash(error: BaseException, folder: Path | None) -> Path:
+    """Save the traceback beside the map of a run of ours in `folder`, else in the temporary folder."""
+    text = "".join(traceback.format_exception(error))
+    if folder is not None and holds_map(folder):
+        note = folder / WORK / CRASH_NOTE
         with contextlib.suppress(OSError):
-            if place is not None:
-                place.mkdir(parents=True, exist_ok=True)
-                note = place / "crash.txt"
-                note.write_text(text, encoding="utf-8")
-                return note
+            write_text(note, text)
+            return note
+    with contextlib.suppress(OSError):
+        descriptor, name = tempfile.mkstemp(prefix="onthefly3r-crash-", suffix=".txt")
+        with open(descriptor, "w", encoding="utf-8", errors="backslashreplace") as stream:  # noqa: PTH123 - a descriptor
+            stream.write(text)
+        return Path(name)
     sys.stderr.write(text)
     return Path("standard error")
 

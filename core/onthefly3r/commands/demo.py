@@ -21,7 +21,7 @@ from ..options import Options
 from ..protocol import ProgressCallback
 
 if TYPE_CHECKING:
-    from ..run.session import Result
+    from ..run.result import Result
     from ..simulate.flight import Survey, SurveyOptions
 
 CLOUD_SAMPLE = 20_000

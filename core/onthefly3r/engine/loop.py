@@ -136,6 +136,10 @@ class Engine:
     def add(self, shot: Shot) -> None:
         """Take one more shot and go as far as the images at hand allow."""
         self.add_all([shot])
+        self.advance()
+
+    def advance(self) -> None:
+        """Go as far as the images at hand allow."""
         self._advance(finishing=False)
 
     def add_all(self, shots: Iterable[Shot]) -> None:

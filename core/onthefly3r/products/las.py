@@ -50,7 +50,7 @@ class CloudWriter:
     Red, green and blue are 16 bit (8 bit x 257). Point source id is the image number from 1 (shot index + 1); with
     more images than it can count, it is 0 and the extra dimension `image` holds the number. Further extra dimensions:
     `confidence` 0..255, `batch`, `n_views` (also in user data, which QGIS keeps). Every point is return 1 of 1 and
-    class 0. A `<name>.copc.laz` left beside by QGIS is removed, because QGIS would show it instead.
+    class 0.
     """
 
     def __init__(self, path: Path, wkt1: str | None, scale_m: float, description: str = "", n_images: int = 0) -> None:
@@ -98,7 +98,6 @@ class CloudWriter:
             raise ReconstructionError(
                 "the cloud has no points; lower min_confidence, or look at the rejected images in the report"
             )
-        self._path.with_name(f"{self._path.stem}.copc.laz").unlink(missing_ok=True)
         written = self._writer.header
         low, high = np.quantile(np.concatenate(self._sample), [WINDOW_TAIL, 1.0 - WINDOW_TAIL], axis=0)
         (min_x, min_y, min_z), (max_x, max_y, max_z) = (map(float, ends) for ends in (written.mins, written.maxs))

@@ -12,26 +12,16 @@ from .runview import RunView
 
 
 def write_products(out: Path, view: RunView) -> dict[str, Any]:
-    """Write everything that is wanted but the report into `out` and return what was made, by product.
-
-    What an earlier export left there and is not wanted now is removed, so that nothing stale lies beside the new files.
+    """Write everything that is wanted but the report into `out`, an empty folder; return what was made, by product.
 
     Raises `ReconstructionError` when a cloud is wanted and has no points.
     """
     wanted = [product for product in PRODUCTS if product.wanted(view.options.export)]
-    remove_products(out)
     made = _cloud_pass(out, view, [product for product in wanted if product.sink is not None])
     for product in wanted:
         if product.write is not None:
             made[product.name] = product.write(out, view, made)
     return made
-
-
-def remove_products(out: Path) -> None:
-    """Remove the files of an earlier result, so that none can pass for one of the next, which may fail."""
-    for product in PRODUCTS:
-        for name in product.files:
-            (out / name).unlink(missing_ok=True)
 
 
 def _cloud_pass(out: Path, view: RunView, products: list[Product]) -> dict[str, Any]:

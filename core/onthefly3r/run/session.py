@@ -1,69 +1,35 @@
-"""One run from a folder of photographs to the files of the user: the entry of command line, Python and QGIS."""
+"""One run: photographs are fed, the map grows, the files are written. `run`, Python and QGIS all go through it."""
 
 from __future__ import annotations
 
-import json
+import contextlib
 import shutil
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 from ..backbones.registry import create_backbone
-from ..earth.georef import check_crs, georeference, metres_per_map_unit
-from ..earth.ground import ground_normal
 from ..engine.loop import Engine
-from ..errors import InputError, ReconstructionError
+from ..errors import Cancelled, InputError
 from ..features.extraction import FeatureStore
-from ..files.atomic import write_text
+from ..files.room import MIB, is_storage_trouble, require_room, storage_error
 from ..intake.images import load_working_image
-from ..intake.positions_file import read_positions, with_positions
 from ..intake.reading import read_flight
-from ..map.journal import shot_from_json, shot_to_json
-from ..map.state import MapState
-from ..map.store import Store
-from ..options import Options, slice_classes
-from ..products.clip import require_boundary_near
-from ..products.exportframe import ExportFrame
-from ..products.las import CloudSummary
-from ..products.page import write_page
-from ..products.report import RejectedImage, RunSummary, Timing, build_report, write_report
-from ..products.runview import RunView
-from ..products.writing import remove_products, write_products
+from ..options import Options
 from ..protocol import Progress, ProgressCallback
-from ..records import GeoReference, RefusedPhotograph, Rejection, Shot
+from ..records import RefusedPhotograph, Shot
 from ..selection.describer import create_describer
-from ..stopwatch import Stopwatch, peak_rss_mib
+from ..stopwatch import Stopwatch
+from .export import require_fitting
+from .folder import PRODUCT_FILES, RunFolder
+from .record import RunRecord
+from .result import Mapped, Result, write_failure, write_result
 
-MAX_RUN_FILE_BYTES = 256 * 1024 * 1024
-RUN_FILES = ("features", "chunks", "journal.jsonl", "run.json", "crash.txt")  # in OUT/work
-
-
-@dataclass(frozen=True)
-class Result:
-    """What a run made."""
-
-    report: dict[str, Any]
-    report_path: Path
-    cloud: Path | None
-    cameras: Path | None
-    placed: int
-    given: int
-
-
-@dataclass(frozen=True)
-class _Outcome:
-    """The state of affairs that the files and the report are made from."""
-
-    shots: dict[int, Shot]
-    rejections: dict[int, Rejection]
-    retries: dict[int, int]
-    refused: Sequence[RefusedPhotograph]
-    backbone: str
-    backbone_facts: dict[str, Any]
-    details: dict[str, Any]
-    warnings: Sequence[str]
+RECORD_EVERY_S = 10.0
+# What one photograph takes on the disk while a run lasts: its features, and a point of the map, its place in the
+# store and in the cloud, for each pixel of the dense grid.
+FEATURE_BYTES, POINT_BYTES = 160, 60
 
 
 def reconstruct(
@@ -75,50 +41,197 @@ def reconstruct(
 ) -> Result:
     """Reconstruct a folder of photographs into `out`; same names and defaults as the command line.
 
+    An earlier result in `out` is replaced when the new one is complete, and stays as it was when that fails.
+
     Raises:
-        InputError: the folder, an option or the environment is wrong; nothing was written.
-        ReconstructionError: nothing could be reconstructed or georeferenced; the report is written.
+        InputError: the folder, an option or the environment is wrong, or `out` holds what is not ours; nothing was
+            changed.
+        ReconstructionError: nothing could be reconstructed or georeferenced; a report is written.
+        StorageError: no room or no access.
         Cancelled: `cancel` returned true.
     """
-    photos, out, options = Path(photos), Path(out), options or Options()
-    stopwatch = Stopwatch()
-    features = FeatureStore(out / "work" / "features", options.backbone.features, options.backbone.threads)
-    backbone = create_backbone(options.backbone, features)
-    describer = create_describer(options.selection, features, options.backbone.device)
-    with stopwatch.stage("intake"):
-        flight = read_flight(photos, options, leave_out=out)
-        shots, refused = flight.shots, flight.refused
-        check_crs(dict(enumerate(shots)), options.georeference)
-        if options.export.boundary is not None:  # a wrong one is told before the work, not after it
-            require_boundary_near(Path(options.export.boundary), shots)
-    work = _fresh_work_folder(out)
-    engine = Engine(
-        work,
-        options,
-        backbone,
-        describer,
-        lambda shot: load_working_image(shot, options.backbone.working_px, engine.warnings.append),
-        progress,
-        cancel,
-    )
-    engine.stopwatch = stopwatch
-    engine.warnings += flight.warnings
-    with single_threaded_blas():
-        engine.add_all(shots)
-        engine.finish()
-    shutil.rmtree(work / "features", ignore_errors=True)
-    write_text(work / "run.json", json.dumps(_run_to_json(engine, backbone.spec.facts(), refused)))
-    outcome = _Outcome(
-        engine.shots,
-        engine.rejections,
-        engine.retries,
-        refused,
-        engine.backbone_name,
-        backbone.spec.facts(),
-        engine.details(),
-        engine.warnings,
-    )
-    return _finish(out, work, engine.state, engine.store, outcome, options, stopwatch, progress, cancel)
+    with Session.open(out, options, progress, cancel) as session:
+        session.feed_folder(Path(photos))
+        return session.finish()
+
+
+class Session:
+    """A run under way: feed photographs, step, finish. Made by `Session.open`."""
+
+    def __init__(
+        self,
+        folder: RunFolder,
+        options: Options,
+        progress: ProgressCallback | None = None,
+        cancel: Callable[[], bool] | None = None,
+    ) -> None:
+        self.folder = folder
+        self.options = options
+        self.refused: list[RefusedPhotograph] = []
+        self.photos = ""
+        self._stopwatch = Stopwatch()
+        self._progress = progress
+        self._cancel = cancel
+        self._engine: Engine | None = None
+        self._work: Path | None = None
+        self._recorded_s = 0.0
+        self._mapped = False
+        self._facts: dict[str, object] = {}
+
+    @classmethod
+    @contextlib.contextmanager
+    def open(
+        cls,
+        out: Path,
+        options: Options | None = None,
+        progress: ProgressCallback | None = None,
+        cancel: Callable[[], bool] | None = None,
+    ) -> Iterator[Session]:
+        """Claim `out` for a run and yield its session; what a block that fails leaves can be exported.
+
+        Raises as `RunFolder.claim` does.
+        """
+        options = options or Options()
+        with RunFolder.claim(Path(out), "run", names=PRODUCT_FILES) as folder:
+            session = cls(folder, options, progress, cancel)
+            try:
+                yield session
+            except BaseException as error:
+                session._keep(error)
+                if isinstance(error, OSError) and is_storage_trouble(error):
+                    raise storage_error(error, folder.path) from error
+                raise
+
+    @property
+    def placed(self) -> int:
+        """Number of photographs that the map holds."""
+        return len(self._engine.state.frames) if self._engine else 0
+
+    def feed_folder(self, photos: Path) -> None:
+        """Read the photographs of a folder and take them all; raises `InputError` when it holds none."""
+        with self._stopwatch.stage("intake"):
+            flight = read_flight(photos, self.options, leave_out=self.folder.path)
+        self.photos = str(photos)
+        self.feed(flight.shots, flight.refused, flight.warnings)
+
+    def feed(
+        self, shots: Sequence[Shot], refused: Sequence[RefusedPhotograph] = (), warnings: Sequence[str] = ()
+    ) -> None:
+        """Take photographs that are whole; those that were `refused` are only counted, `warnings` go to the report.
+
+        Raises `InputError` when CRS, positions or boundary do not go with them, `StorageError` without room for them.
+        """
+        known = list(self._engine.shots.values()) if self._engine else []
+        require_fitting([*known, *shots], self.options)
+        require_room(self.folder.path, room_bytes(len(shots), self.options), f"a run of {len(shots)} photographs")
+        engine = self._engine or self._begin()
+        self.refused += refused
+        engine.warnings += warnings
+        self._record(to_come=shots)  # before they are read, so that the record of a run that is killed then is whole
+        with single_threaded_blas():
+            engine.add_all(shots)
+
+    def step(self) -> None:
+        """Place photographs as far as those at hand allow; the rest waits for more, or for `finish`."""
+        if self._engine is None:
+            raise InputError("the session has no photographs: feed some")
+        with single_threaded_blas():
+            self._engine.advance()
+        self._record()
+
+    def finish(self) -> Result:
+        """Place what is still waiting, and write all files; raises as `reconstruct` does."""
+        engine, work = self._engine, self._work
+        if engine is None or work is None:
+            raise InputError("the session has no photographs: feed some")
+        with single_threaded_blas():
+            engine.finish()
+        shutil.rmtree(work / "features", ignore_errors=True)
+        record = self._record(mapped=True)
+        return write_result(
+            self.folder,
+            Mapped(engine.state, engine.store, record),
+            self.options,
+            self._stopwatch,
+            self.folder.publish_run,
+            self._progress,
+            self._cancel,
+        )
+
+    def _begin(self) -> Engine:
+        """Make the engine and the folder that its map grows in; what lacks for a run is told before anything goes."""
+        backbone_options, work = self.options.backbone, self.folder.plan_map()
+        features = FeatureStore(work / "features", backbone_options.features, backbone_options.threads)
+        backbone = create_backbone(backbone_options, features)
+        describer = create_describer(self.options.selection, features, backbone_options.device)
+        self.folder.begin_map()
+        engine = Engine(
+            work,
+            self.options,
+            backbone,
+            describer,
+            lambda shot: load_working_image(shot, backbone_options.working_px, engine.warnings.append),
+            self._follow,
+            self._cancel,
+        )
+        engine.stopwatch = self._stopwatch
+        self._facts = backbone.spec.facts()
+        self._work, self._engine = work, engine
+        return engine
+
+    def _follow(self, progress: Progress) -> None:
+        if time.monotonic() - self._recorded_s > RECORD_EVERY_S:
+            self._record()
+        if self._progress is not None:
+            self._progress(progress)
+
+    def _record(self, mapped: bool = False, error: str | None = None, to_come: Sequence[Shot] = ()) -> RunRecord:
+        engine, work = self._engine, self._work
+        assert engine is not None and work is not None
+        record = RunRecord(
+            options=self.options.to_flat(),
+            backbone=engine.backbone_name,
+            backbone_facts=self._facts,
+            photos=self.photos,
+            stage="mapped" if mapped else "reconstructing",
+            error=error,
+            shots={**engine.shots, **{len(engine.shots) + number: shot for number, shot in enumerate(to_come)}},
+            refused=self.refused,
+            rejections=engine.rejections,
+            retries=engine.retries,
+            details=engine.details(),
+            warnings=engine.warnings,
+        )
+        record.write(work)
+        self._recorded_s, self._mapped = time.monotonic(), mapped
+        return record
+
+    def _keep(self, error: BaseException) -> None:
+        """Keep the map that a failure leaves, and say in the error how to use it; remove one that holds nothing."""
+        if self._engine is None or not (self.folder.attempt or self.folder.stamp.map_open):
+            return  # nothing was begun, or everything is in its place
+        if not self.placed and not self._mapped:
+            self.folder.abandon_map()
+            return
+        if not self._mapped:  # else the failure is one of the export, which has reported it
+            with contextlib.suppress(Exception):  # what ended the run is to be heard, not this
+                record = self._record(error=str(error) or type(error).__name__)
+                if isinstance(error, Exception) and not isinstance(error, Cancelled):
+                    mapped = Mapped(self._engine.state, self._engine.store, record)
+                    write_failure(self.folder, mapped, self.options, self._stopwatch, error)
+        if not self.placed:
+            return
+        given = len(self._engine.shots) + len(self.refused)
+        error.way_on = (  # type: ignore[attr-defined]
+            f"{self.placed} of {given} photographs are placed: 'onthefly3r export {self.folder.home} NEW-FOLDER' "
+            "writes their files"
+        )
+
+
+def room_bytes(photographs: int, options: Options) -> int:
+    """Return about how many bytes a run over so many photographs writes."""
+    grid = 0.75 * options.backbone.dense_px**2
+    return int(20 * MIB + photographs * (options.backbone.features * FEATURE_BYTES + grid * POINT_BYTES))
 
 
 def single_threaded_blas() -> AbstractContextManager[object]:
@@ -131,204 +244,3 @@ def single_threaded_blas() -> AbstractContextManager[object]:
 
     limits: AbstractContextManager[object] = threadpool_limits(limits=1, user_api="blas")
     return limits
-
-
-def export_again(
-    run: Path, out: Path, options: Options | None = None, progress: ProgressCallback | None = None
-) -> Result:
-    """Write the files of an earlier run again into `out`, with another CRS, format or spacing.
-
-    Raises `InputError` when `run` holds no map, and what `reconstruct` raises.
-    """
-    run, out, options = Path(run), Path(out), options or Options()
-    stopwatch = Stopwatch()
-    store = Store(run / "work")
-    state = MapState.load(store)
-    outcome = _read_run(run / "work" / "run.json")
-    if options.georeference.positions is not None:
-        file = read_positions(Path(options.georeference.positions))
-        placed_anew, told = with_positions([shot for _, shot in sorted(outcome.shots.items())], file)
-        shots = dict(zip(sorted(outcome.shots), placed_anew, strict=True))
-        outcome = replace(outcome, shots=shots, warnings=[*outcome.warnings, *told])
-    check_crs(outcome.shots, options.georeference)
-    if options.export.boundary is not None:
-        require_boundary_near(Path(options.export.boundary), list(outcome.shots.values()))
-    out.mkdir(parents=True, exist_ok=True)
-    remove_products(out)
-    return _finish(out, out / "work", state, store, outcome, options, stopwatch, progress, None)
-
-
-def earlier_options(run: Path) -> dict[str, Any]:
-    """Return the options of georeferencing and export that an earlier run in `run` was made with, by name.
-
-    Left out are its files: positions stay with the photographs of the run, and a boundary need not be there any more.
-    """
-    path = Path(run) / "work" / "run.json"
-    try:
-        if path.stat().st_size > MAX_RUN_FILE_BYTES:
-            raise ValueError(f"larger than {MAX_RUN_FILE_BYTES} bytes")
-        told = json.loads(path.read_text(encoding="utf-8"))["options"]
-        slices = slice_classes()
-        names = {item.name for name in ("georeference", "export") for item in fields(slices[name])}
-        return {name: told[name] for name in names - {"positions", "boundary", "cloud"} if name in told}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path} is no record of a run ({error}); name the output folder of a run") from error
-
-
-def _finish(
-    out: Path,
-    work: Path,
-    state: MapState,
-    store: Store,
-    outcome: _Outcome,
-    options: Options,
-    stopwatch: Stopwatch,
-    progress: ProgressCallback | None,
-    cancel: Callable[[], bool] | None,
-) -> Result:
-    """Georeference, write the files and, whatever happens, the report."""
-    cloud: CloudSummary | None = None
-    reference: GeoReference | None = None
-    failure: ReconstructionError | None = None
-    metres_per_unit: float | None = None
-    warnings = list(outcome.warnings)
-    placed, rejected = len(state.frames), len(outcome.rejections) + len(outcome.refused)
-
-    def checkpoint(stage: str, done: int, total: int) -> None:
-        from ..errors import Cancelled
-
-        if cancel is not None and cancel():
-            raise Cancelled("stopped on request; run again to start anew")
-        if progress is not None:
-            progress(Progress(stage, done, total, placed, rejected, 0))
-
-    try:
-        if not state.frames:
-            raise ReconstructionError(
-                "no photographs could be reconstructed together: they overlap too little or show too little texture; "
-                "the report lists what each one lacked"
-            )
-        with stopwatch.stage("georeference"):
-            checkpoint("georeferencing", 0, 1)
-            up = ground_normal(state)
-            poses = {index: state.map_from_cam(index) for index in state.frames}
-            if options.georeference.local:
-                metres_per_unit = metres_per_map_unit(poses, outcome.shots, options.georeference)
-                if metres_per_unit is None:
-                    warnings.append("no positions tell the scale: the units of the local frame are not metres")
-            else:
-                reference = georeference(poses, outcome.shots, options.georeference, up)
-        with stopwatch.stage("export"):
-            view = RunView(
-                title=out.resolve().name,
-                options=options,
-                state=state,
-                store=store,
-                shots=outcome.shots,
-                rejections=outcome.rejections,
-                retries=outcome.retries,
-                refused=outcome.refused,
-                reference=reference,
-                frame=ExportFrame.of(reference, up, metres_per_unit),
-                work=work,
-                checkpoint=checkpoint,
-            )
-            cloud = write_products(out, view).get("cloud")
-    except ReconstructionError as error:
-        failure = error
-    summary = RunSummary(
-        options=options,
-        backbone=outcome.backbone,
-        given=len(outcome.shots) + len(outcome.refused),
-        placed=placed,
-        rejected=_rejected(outcome),
-        timing=Timing(stopwatch.total_s, stopwatch.stages.get("backbone", 0.0), dict(stopwatch.stages)),
-        georeference=reference,
-        cloud=cloud,
-        error=str(failure) if failure else None,
-        warnings=warnings,
-        details=outcome.details,
-        backbone_facts=outcome.backbone_facts,
-        stage_memory=stopwatch.memory,
-    )
-    report = build_report(summary, peak_rss_mib())
-    write_report(out / "report.json", report)
-    write_page(out / "report.html", report, out.resolve().name)
-    if failure is not None:
-        raise failure
-    return Result(
-        report=report,
-        report_path=out / "report.json",
-        cloud=cloud.path if cloud else None,
-        cameras=out / "cameras.shp",
-        placed=placed,
-        given=summary.given,
-    )
-
-
-def _fresh_work_folder(out: Path) -> Path:
-    """Make OUT/work empty, and take away the products of an earlier run so that none can pass for this one's."""
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: is a file; name a folder for the results")
-    work = out / "work"
-    earlier = (out / "report.json").exists() or any((work / name).exists() for name in RUN_FILES)
-    if not earlier and out.exists():
-        taken = [p.name for p in out.iterdir() if p.name != "work" or any(p.iterdir())]
-        if taken:
-            raise InputError(f"{out}: is not empty (it holds {taken[0]}) and no earlier result; name another folder")
-    remove_products(out)
-    if any((work / name).exists() for name in RUN_FILES):
-        shutil.rmtree(work)
-    work.mkdir(parents=True, exist_ok=True)
-    return work
-
-
-def _rejected(outcome: _Outcome) -> list[RejectedImage]:
-    listed = [RejectedImage(r.name, "intake", r.reason, dict(r.numbers)) for r in outcome.refused]
-    for index, rejection in sorted(outcome.rejections.items()):
-        name = outcome.shots[index].name
-        listed.append(RejectedImage(name, rejection.stage, rejection.reason, dict(rejection.numbers)))
-    return listed
-
-
-def _run_to_json(
-    engine: Engine, backbone_facts: dict[str, Any], refused: Sequence[RefusedPhotograph]
-) -> dict[str, Any]:
-    return {
-        "options": engine.options.to_flat(),
-        "backbone": engine.backbone_name,
-        "backbone_facts": backbone_facts,
-        "details": engine.details(),
-        "warnings": list(engine.warnings),
-        "shots": {str(i): shot_to_json(shot) for i, shot in engine.shots.items()},
-        "retries": {str(i): count for i, count in engine.retries.items()},
-        "rejections": {
-            str(i): {"stage": r.stage, "reason": r.reason, "numbers": dict(r.numbers)}
-            for i, r in engine.rejections.items()
-        },
-        "refused": [{"name": r.name, "reason": r.reason, "numbers": dict(r.numbers)} for r in refused],
-    }
-
-
-def _read_run(path: Path) -> _Outcome:
-    if not path.exists():
-        raise InputError(f"{path} is missing: the run did not end; run again")
-    if path.stat().st_size > MAX_RUN_FILE_BYTES:
-        raise InputError(f"{path} is larger than {MAX_RUN_FILE_BYTES} bytes and not one of ours; run again")
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        return _Outcome(
-            shots={int(i): shot_from_json(s) for i, s in stored["shots"].items()},
-            rejections={
-                int(i): Rejection((int(i),), r["stage"], r["reason"], r["numbers"])
-                for i, r in stored["rejections"].items()
-            },
-            retries={int(i): int(n) for i, n in stored["retries"].items()},
-            refused=[RefusedPhotograph(r["name"], r["reason"], r["numbers"]) for r in stored["refused"]],
-            backbone=str(stored["backbone"]),
-            backbone_facts=dict(stored["backbone_facts"]),
-            details=dict(stored["details"]),
-            warnings=list(stored["warnings"]),
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path} is damaged ({error!r}); run again") from error
