@@ -200,7 +200,8 @@ def test_a_map_that_cannot_be_georeferenced_stays_beside_the_earlier_result(case
     out = tmp_path / "out"
     shutil.copytree(case.out, out)
     before = listing(out)
-    (tmp_path / "geo.txt").write_text("EPSG:4326\nnobody.JPG 15.0 48.0 300\n", encoding="utf-8")
+    name = sorted(case.photos.glob("*.JPG"))[2].name
+    (tmp_path / "geo.txt").write_text(f"EPSG:4326\n{name} 15.0 48.0 300\n", encoding="utf-8")
     few = Options.from_flat({**FAST, "dense_px": 64, "positions": str(tmp_path / "geo.txt")})
     with pytest.raises(GeoreferenceError) as failed:
         reconstruct(case.photos, out, few)
