@@ -18,9 +18,9 @@ from ..products.clip import require_boundary_near
 from ..protocol import ProgressCallback
 from ..records import GeoReference, Shot
 from ..stopwatch import Stopwatch
-from .folder import FAILURE, PRODUCT_FILES, RESULT, RunFolder, settle
 from .record import RunRecord
 from .result import Mapped, Result, write_result
+from .run_folder import FAILURE, PRODUCT_FILES, RESULT, RunFolder, settle
 
 
 def export(run: Path, out: Path, options: Options | None = None, progress: ProgressCallback | None = None) -> Result:

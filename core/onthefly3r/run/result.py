@@ -24,8 +24,8 @@ from ..products.writing import write_products
 from ..protocol import Progress, ProgressCallback
 from ..records import GeoReference
 from ..stopwatch import Stopwatch, peak_rss_mib
-from .folder import FAILED_REPORTS, FAILURE, REPORTS, RESULT, RunFolder
 from .record import RunRecord
+from .run_folder import FAILED_REPORTS, FAILURE, REPORTS, RESULT, RunFolder
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,9 @@ from ..records import RefusedPhotograph, Shot
 from ..selection.describer import create_describer
 from ..stopwatch import Stopwatch
 from .export import require_fitting
-from .folder import PRODUCT_FILES, RunFolder
 from .record import RunRecord
 from .result import Mapped, Result, write_failure, write_result
+from .run_folder import PRODUCT_FILES, RunFolder
 
 RECORD_EVERY_S = 10.0
 # What one photograph takes on the disk while a run lasts: its features, and a point of the map, its place in the
