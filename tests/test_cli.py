@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 from onthefly3r.commands.cli import app
 from onthefly3r.errors import Cancelled, GeoreferenceError
-from onthefly3r.files.stamp import Stamp
+from onthefly3r.files.ownership import Stamp
 from onthefly3r.options import Options, iterate_options
 from onthefly3r.protocol import Event, Progress
 

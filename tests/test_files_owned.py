@@ -18,8 +18,8 @@ from onthefly3r.errors import BusyError, InputError, OnTheFly3RError, StorageErr
 from onthefly3r.files import atomic, owned
 from onthefly3r.files.lock import LOCK_NAME
 from onthefly3r.files.owned import OwnedFolder
+from onthefly3r.files.ownership import STAMP_NAME, read_stamp
 from onthefly3r.files.room import storage_errors
-from onthefly3r.files.stamp import STAMP_NAME, read_stamp
 
 ROOT = Path(__file__).resolve().parents[1]
 POSIX = pytest.mark.skipif(os.name == "nt", reason="of POSIX systems")

@@ -22,8 +22,8 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from .. import protocol
 from ..errors import Cancelled, MissingDependencyError, OnTheFly3RError, ReconstructionError, StorageError
 from ..files.atomic import write_text
+from ..files.ownership import CRASH_NOTE, WORK, holds_map
 from ..files.room import is_storage_trouble, storage_error
-from ..files.stamp import CRASH_NOTE, WORK, holds_map
 
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name)]
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 from ..errors import InputError, StorageError
 from .atomic import sync_file, sync_folder
 from .lock import LOCK_NAME, FolderLock
+from .ownership import STAMP_NAME, WORK, Listed, Move, Publication, Stamp, fingerprint, read_stamp
 from .room import require_access, require_room, storage_error, storage_errors
-from .stamp import STAMP_NAME, WORK, Listed, Move, Publication, Stamp, fingerprint, read_stamp
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..files.owned import OwnedFolder, relative_files, require_free
+from ..files.ownership import MAP, WORK, Listed, Stamp, fingerprint, read_stamp
 from ..files.room import storage_errors
-from ..files.stamp import MAP, WORK, Listed, Stamp, fingerprint, read_stamp
 from ..products.catalogue import PRODUCTS
 
 RESULT, FAILURE = "result", "failure"  # groups of files, each replaced as a whole, beside that of the map
