@@ -21,8 +21,6 @@ from onthefly3r.map.store import Store
 from onthefly3r.records import Frame, Sighting, Submap
 from onthefly3r.simulate.oracle import Bend
 
-pytest.importorskip("gtsam")
-
 CAMERA = Camera(56, 42, 38.0, 38.0, 28.0, 21.0)
 DOWN = np.diag([1.0, -1.0, -1.0])
 HEIGHT = 1.0  # of the cameras above the ground; all lengths in this unit

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from onthefly3r.errors import MissingDependencyError
 from onthefly3r.geometry.camera import Camera, PixelMap
 from onthefly3r.geometry.transforms import Rigid3, Sim3, rotation_angle_deg, rotation_exp
 from onthefly3r.graph.posegraph import (
@@ -31,11 +31,11 @@ from onthefly3r.graph.sightings import (
     view_edge,
     view_noise,
 )
+from onthefly3r.graph.solver import PoseGraphSolver
+from onthefly3r.graph.sparse_solver import SparseSolver
 from onthefly3r.map.state import MapState
 from onthefly3r.map.store import Store
 from onthefly3r.records import Edge, Frame, FrameEdge, Sighting, Submap
-
-gtsam = pytest.importorskip("gtsam")
 
 SIGMA = np.array([0.002, 0.002, 0.002, 0.02, 0.02, 0.02, 0.002])  # rotation rad, translation, log scale
 COVARIANCE = np.diag(SIGMA**2)
@@ -93,8 +93,20 @@ def state_of(work: Path, poses: dict[int, Sim3], edges: list[Edge]) -> MapState:
     return state
 
 
+@pytest.fixture(params=["sparse", "gtsam"])
+def solver(request: pytest.FixtureRequest) -> PoseGraphSolver:
+    """Each of the two solvers."""
+    if request.param == "sparse":
+        return SparseSolver()
+    pytest.importorskip("gtsam")
+    from onthefly3r.graph.gtsam_solver import GtsamSolver
+
+    return GtsamSolver()
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_gtsam_similarities_mean_s_times_r_p_plus_t(seed: int) -> None:
+    pytest.importorskip("gtsam")
     from onthefly3r.graph.gtsam_solver import from_similarity3, to_similarity3
 
     rng = np.random.default_rng(seed)
@@ -108,11 +120,11 @@ def test_gtsam_similarities_mean_s_times_r_p_plus_t(seed: int) -> None:
     np.testing.assert_allclose(from_similarity3(to_similarity3(first).inverse()).matrix(), first.inverse().matrix())
 
 
-def test_a_closed_ring_gets_better_and_its_first_submap_stays() -> None:
+def test_a_closed_ring_gets_better_and_its_first_submap_stays(solver: PoseGraphSolver) -> None:
     truth, rng = ring(), np.random.default_rng(1)
     edges = [measured(truth, k, (k + 1) % 12, rng, bend=2.0) for k in range(12)]
     drifted = chained(edges, truth[0])
-    solved = default_solver().solve_sim3(drifted, edges, [], fixed=0)
+    solved = solver.solve_sim3(drifted, edges, [], fixed=0)
     np.testing.assert_allclose(solved[0].matrix(), truth[0].matrix(), atol=1e-9)
     assert errors(drifted, truth).max() > 1.0
     assert errors(solved, truth).max() < 0.35 * errors(drifted, truth).max()
@@ -120,25 +132,25 @@ def test_a_closed_ring_gets_better_and_its_first_submap_stays() -> None:
     assert np.abs(np.log(scales)).max() < 0.08
 
 
-def test_consistent_edges_are_met_exactly() -> None:
+def test_consistent_edges_are_met_exactly(solver: PoseGraphSolver) -> None:
     truth = ring()
     silent = [Edge(a, b, truth[a].inverse() @ truth[b], COVARIANCE) for a in range(12) for b in range(a)]
     rng = np.random.default_rng(2)
     moved = {k: pose @ exp(0.05 * rng.standard_normal(7)) if k else pose for k, pose in truth.items()}
-    solved = default_solver().solve_sim3(moved, silent, [], fixed=0)
+    solved = solver.solve_sim3(moved, silent, [], fixed=0)
     assert errors(solved, truth).max() < 1e-4
 
 
-def test_a_wrong_loop_is_outvoted() -> None:
+def test_a_wrong_loop_is_outvoted(solver: PoseGraphSolver) -> None:
     truth, rng = ring(), np.random.default_rng(3)
     edges = [measured(truth, k, (k + step) % 12, rng) for k in range(12) for step in (1, 2)]
     wrong = Edge(2, 8, Sim3(1.0, np.eye(3), np.array([9.0, 0.0, 0.0])), COVARIANCE)
-    alone = default_solver().solve_sim3(truth, edges, [], fixed=0)
-    with_wrong = default_solver().solve_sim3(truth, [*edges, wrong], [], fixed=0)
+    alone = solver.solve_sim3(truth, edges, [], fixed=0)
+    with_wrong = solver.solve_sim3(truth, [*edges, wrong], [], fixed=0)
     assert errors(with_wrong, truth).max() < errors(alone, truth).max() + 0.1
 
 
-def test_frames_of_the_papers_graph(tmp_path: Path) -> None:
+def test_frames_of_the_papers_graph(tmp_path: Path, solver: PoseGraphSolver) -> None:
     """SE(3): relative poses round a ring; only cameras move."""
     truth = {k: Rigid3(pose.rotation, pose.translation) for k, pose in ring().items()}
     rng = np.random.default_rng(4)
@@ -152,7 +164,7 @@ def test_frames_of_the_papers_graph(tmp_path: Path) -> None:
         drifted[k + 1] = drifted[k] @ edges[k].source_from_target
     state = state_of(tmp_path, {k: Sim3(1.0, p.rotation, p.translation) for k, p in drifted.items()}, [])
     state.frame_edges.extend(edges)
-    optimise_frames(state, default_solver())
+    optimise_frames(state, solver)
     before = max(np.linalg.norm(drifted[k].translation - truth[k].translation) for k in truth)
     after = max(np.linalg.norm(state.map_from_cam(100 + k).translation - truth[k].translation) for k in truth)
     assert after < 0.5 * before
@@ -160,17 +172,17 @@ def test_frames_of_the_papers_graph(tmp_path: Path) -> None:
     np.testing.assert_array_equal(state.map_from_submap[5].translation, drifted[5].translation)
 
 
-def test_cameras_follow_their_submaps_and_a_tree_stays_as_it_is(tmp_path: Path) -> None:
+def test_cameras_follow_their_submaps_and_a_tree_stays_as_it_is(tmp_path: Path, solver: PoseGraphSolver) -> None:
     truth, rng = ring(), np.random.default_rng(5)
     chain = [measured(truth, k, k + 1, rng, bend=2.0) for k in range(11)]
     drifted = chained(chain, truth[0])
     lonely = state_of(tmp_path / "lonely", drifted, [])
-    assert optimise_submaps(lonely, default_solver()) == 0.0
+    assert optimise_submaps(lonely, solver) == 0.0
     tree = state_of(tmp_path / "tree", drifted, chain)
-    assert optimise_submaps(tree, default_solver()) == 0.0
+    assert optimise_submaps(tree, solver) == 0.0
     loop = Edge(0, 11, truth[0].inverse() @ truth[11], COVARIANCE)
     state = state_of(tmp_path / "loop", drifted, [*chain, loop])
-    shift = optimise_submaps(state, default_solver())
+    shift = optimise_submaps(state, solver)
     moved = np.array([state.map_from_cam(100 + k).translation - drifted[k].translation for k in truth])
     assert shift == pytest.approx(np.abs(moved).max() / 0.1)
     assert errors(state.map_from_submap, truth).max() < errors(drifted, truth).max()
@@ -228,21 +240,21 @@ def rms(state: MapState, cameras: dict[int, Rigid3], of: set[int]) -> float:
     )
 
 
-def test_a_frame_goes_to_the_mean_of_what_several_submaps_say(tmp_path: Path) -> None:
+def test_a_frame_goes_to_the_mean_of_what_several_submaps_say(tmp_path: Path, solver: PoseGraphSolver) -> None:
     better = []
     for seed in range(4):
         state, cameras = block(tmp_path / str(seed), seed)
         count = {i: sum(seen.frame == i for seen in state.sightings) for i in cameras}
         often = {i for i, n in count.items() if n >= 2}
         before = rms(state, cameras, often)
-        optimise_submaps(state, default_solver())
+        optimise_submaps(state, solver)
         better.append(rms(state, cameras, often) / before)
     # Three views or more each; the submaps, true before, take their share of the noise.
     assert np.mean(better) < 0.8
 
 
 @pytest.mark.parametrize("unit", [1.0, 50.0])
-def test_the_noise_of_views_is_what_the_misfits_show(tmp_path: Path, unit: float) -> None:
+def test_the_noise_of_views_is_what_the_misfits_show(tmp_path: Path, unit: float, solver: PoseGraphSolver) -> None:
     """Whatever the map's unit; views placed wrong do not count."""
     state, _ = block(tmp_path, 3, n_submaps=30, n_frames=120, seen=12)
     change = Sim3(unit, np.eye(3), np.zeros(3))
@@ -256,7 +268,7 @@ def test_the_noise_of_views_is_what_the_misfits_show(tmp_path: Path, unit: float
     noise = ViewNoise(0.01, 0.1 * unit, 0.01)
     for _ in range(2):
         edges = [view_edge(seen, scales[seen.submap], noise) for seen in sightings]
-        solved = default_solver().solve_sim3(nodes, edges, [], fixed=0)
+        solved = solver.solve_sim3(nodes, edges, [], fixed=0)
         noise = view_noise(misfits_at_camera(solved, sightings), sightings, 1e-9)
     assert noise.rotation_rad == pytest.approx(NOISE.rotation_rad, rel=0.2)
     assert noise.position == pytest.approx(unit * NOISE.position, rel=0.2)
@@ -287,14 +299,16 @@ def prior_on(pose: Sim3, submap: int, sigma: float = 0.02) -> PosePrior:
     return PosePrior(submap, pose, np.diag(1.0 / (SIGMA * sigma / 0.02) ** 2))
 
 
-def test_priors_unbend_a_chain_and_wrong_ones_are_dropped(tmp_path: Path) -> None:
+def test_priors_unbend_a_chain_and_wrong_ones_are_dropped(tmp_path: Path, solver: PoseGraphSolver) -> None:
     truth, rng = ring(), np.random.default_rng(6)
     chain = [measured(truth, k, k + step, rng, bend=4.0 * step) for k in range(11) for step in (1, 2) if k + step < 12]
-    state = state_of(tmp_path, chained(chain, truth[0]), chain)
+    # A submap is fitted to several references, so that no view of it agrees to the last digit.
+    fitted = {k: pose @ exp(SIGMA * rng.standard_normal(7)) for k, pose in chained(chain, truth[0]).items()}
+    state = state_of(tmp_path, fitted, chain)
     priors = [prior_on(truth[k], k) for k in range(1, 12)]
     priors[4] = prior_on(replace(truth[5], translation=truth[5].translation + 3.0), 5)
     before = errors(state.map_from_submap, truth).max()
-    optimise_submaps(state, default_solver(), priors)
+    optimise_submaps(state, solver, priors)
     after = errors(state.map_from_submap, truth)
     assert before > 2.0 and after[1:].max() < 0.15
     assert after[0] < 0.4  # no prior of its own: as far off as two bent edges lead it
@@ -302,14 +316,14 @@ def test_priors_unbend_a_chain_and_wrong_ones_are_dropped(tmp_path: Path) -> Non
     assert consistent_priors(priors[:1], []) == priors[:1]  # no one to ask
 
 
-def test_a_prior_may_leave_directions_open() -> None:
+def test_a_prior_may_leave_directions_open(solver: PoseGraphSolver) -> None:
     """A position alone: three of seven directions."""
     truth = ring(2)
     information = np.zeros((7, 7))
     information[3:6, 3:6] = np.eye(3) / 0.01**2
     edge = Edge(0, 1, truth[0].inverse() @ truth[1], COVARIANCE)
     target = replace(truth[0], translation=truth[0].translation + np.array([1.0, 2.0, 3.0]))
-    solved = default_solver().solve_sim3(truth, [edge], [PosePrior(0, target, information)], fixed=0)
+    solved = solver.solve_sim3(truth, [edge], [PosePrior(0, target, information)], fixed=0)
     np.testing.assert_allclose(solved[0].translation, target.translation, atol=1e-3)
     np.testing.assert_allclose((solved[0].inverse() @ solved[1]).matrix(), edge.source_from_target.matrix(), atol=1e-4)
 
@@ -341,7 +355,10 @@ def test_floored_keeps_what_is_known_and_makes_the_rest_invertible() -> None:
     np.testing.assert_allclose(result, singular, atol=1e-6)
 
 
-def test_a_missing_gtsam_says_how_to_mend_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_sparse_solver_is_chosen_where_gtsam_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    if importlib.util.find_spec("gtsam") is not None:
+        from onthefly3r.graph.gtsam_solver import GtsamSolver
+
+        assert isinstance(default_solver(), GtsamSolver)
     monkeypatch.setitem(sys.modules, "gtsam", None)
-    with pytest.raises(MissingDependencyError, match="--pose-graph none"):
-        default_solver()
+    assert isinstance(default_solver(), SparseSolver)

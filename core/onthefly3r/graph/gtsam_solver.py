@@ -20,6 +20,15 @@ class GtsamSolver:
         self, nodes: Mapping[int, Sim3], edges: Sequence[Edge], priors: Sequence[PosePrior], fixed: int
     ) -> dict[int, Sim3]:
         """Return optimised map_from_submap of all nodes; without priors the node `fixed` keeps its pose."""
+        graph, values = self.problem(nodes, edges, priors, fixed)
+        solved = _optimise(graph, values)
+        return {key: from_similarity3(solved.atSimilarity3(key)) for key in nodes}
+
+    @staticmethod
+    def problem(
+        nodes: Mapping[int, Sim3], edges: Sequence[Edge], priors: Sequence[PosePrior], fixed: int
+    ) -> tuple[Any, Any]:
+        """Return the factor graph and the values that gtsam optimises."""
         import gtsam
 
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -29,7 +38,8 @@ class GtsamSolver:
             graph.add(gtsam.NonlinearEqualitySimilarity3(fixed, to_similarity3(nodes[fixed])))
         for prior in priors:
             # No kernel: where a whole map has bent, every prior is far off and right.
-            noise = gtsam.noiseModel.Gaussian.Information(floored(prior.information))
+            # False: gtsam otherwise takes what is below 1e-9 off the diagonal for zero.
+            noise = gtsam.noiseModel.Gaussian.Information(floored(prior.information), False)
             graph.add(gtsam.PriorFactorSimilarity3(prior.submap, to_similarity3(prior.map_from_submap), noise))
         for edge in edges:
             graph.add(
@@ -40,8 +50,7 @@ class GtsamSolver:
                     _robust(floored(edge.covariance)),
                 )
             )
-        solved = _optimise(graph, values)
-        return {key: from_similarity3(solved.atSimilarity3(key)) for key in nodes}
+        return graph, values
 
     def solve_se3(self, nodes: Mapping[int, Rigid3], edges: Sequence[FrameEdge], fixed: int) -> dict[int, Rigid3]:
         """Return optimised map_from_cam of all nodes."""
@@ -86,7 +95,7 @@ def _to_pose3(pose: Rigid3) -> Any:
 def _robust(covariance: Float) -> Any:
     import gtsam
 
-    gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance, False)
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER), gaussian)
 
 

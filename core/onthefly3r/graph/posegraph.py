@@ -4,7 +4,7 @@ Nodes are the submaps and those frames that more than one submap saw. An edge jo
 the one that predicted it and those that it was a reference for: the errors of views are independent, whereas relative
 poses of submaps that share a reference err together.
 
-The solver sits behind `PoseGraphSolver`, because gtsam has no wheels for Windows.
+The solver sits behind `PoseGraphSolver`, because gtsam has no wheels for Windows and others.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..errors import MissingDependencyError
 from ..geometry.transforms import Sim3
 from ..map.state import MapState
 from ..records import Edge, Sighting
@@ -31,6 +30,7 @@ from .sightings import (
     view_noise,
 )
 from .solver import PoseGraphSolver, PosePrior, floored
+from .sparse_solver import SparseSolver
 
 MEDIAN_MISFIT = 6.35  # of a chi-squared variable of seven degrees of freedom
 OUTLYING_PRIOR = 10.0  # times the usual squared misfit
@@ -38,14 +38,11 @@ ROUNDS = 3  # of looking for bends in what does not agree yet, and of solving th
 
 
 def default_solver() -> PoseGraphSolver:
-    """Return the gtsam solver; raises `MissingDependencyError` where gtsam is not installed."""
+    """Return the solver on gtsam, which is the faster one, or that on scipy where gtsam is missing or does not load."""
     try:
         import gtsam  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError(
-            "gtsam is not installed, so drift cannot be removed; install it (it has wheels for Linux and macOS) "
-            "or choose --pose-graph none"
-        ) from error
+    except ImportError:
+        return SparseSolver()
     from .gtsam_solver import GtsamSolver
 
     return GtsamSolver()

@@ -41,6 +41,7 @@ class PoseGraphSolver(Protocol):
 
 
 def floored(symmetric: Float) -> Float:
-    """Keep a covariance or information invertible where it leaves a direction all but perfectly known or open."""
-    values, vectors = np.linalg.eigh(0.5 * (symmetric + symmetric.T))
-    return np.asarray((vectors * np.maximum(values, 1e-10 * values.max())) @ vectors.T)
+    """Keep covariances or informations (..., D, D) invertible where a direction is all but perfectly known or open."""
+    values, vectors = np.linalg.eigh(0.5 * (symmetric + np.swapaxes(symmetric, -1, -2)))
+    kept = np.maximum(values, 1e-10 * values.max(axis=-1, keepdims=True))
+    return np.asarray((vectors * kept[..., None, :]) @ np.swapaxes(vectors, -1, -2))
