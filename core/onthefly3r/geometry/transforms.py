@@ -50,7 +50,7 @@ def rotation_log(rotation: Float) -> Float:
         axis = axis / np.linalg.norm(axis, axis=1)[:, None]
         sign = np.where(np.einsum("ni,ni->n", about, axis) >= 0.0, 1.0, -1.0)
         result[half_turn] = (angle[half_turn] * sign)[:, None] * axis
-    return result
+    return np.asarray(result)
 
 
 def translation_jacobian(rotation_vector: Float, log_scale: Float | float) -> Float:
