@@ -128,7 +128,7 @@ def test_folders_without_poses(tmp_path: Path) -> None:
     with pytest.raises(ReferenceFormatError, match="neither trajectory"):
         read_poses(tmp_path)
     (tmp_path / "images.bin").write_bytes(b"")
-    with pytest.raises(ReferenceFormatError, match="model_converter"):
+    with pytest.raises(ReferenceFormatError, match="ends too early"):
         read_poses(tmp_path)
 
 

@@ -162,7 +162,10 @@ def evaluate(
     ],
     reference_poses: Annotated[
         Path | None,
-        typer.Option(help="COLMAP text model, trajectory table (CSV), TUM file, or output folder", metavar="path"),
+        typer.Option(
+            help="COLMAP model, trajectory table (CSV), TUM, KITTI, transforms.json, npz, or output folder",
+            metavar="path",
+        ),
     ] = None,
     reference_cloud: Annotated[
         Path | None, typer.Option(help="LAS, LAZ or PLY cloud, or output folder", metavar="path")

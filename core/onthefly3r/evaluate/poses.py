@@ -53,11 +53,15 @@ def match(estimate: PoseSet, reference: PoseSet) -> tuple[Int, Int]:
     """Return the rows (M,) of the images that both sets hold, in the order of the estimate.
 
     An image matches by its whole relative name, else, case-insensitively, by a file name (last part) that is unique in
-    both sets.
+    both sets. A set whose images are only numbered matches one of the same length by order.
 
     Raises:
         ReferenceFormatError: a file name could match several images, or nothing matches.
     """
+    if len(estimate.names) == len(reference.names) and (_numbered(estimate) != _numbered(reference)):
+        # A KITTI file numbers its images in capture order and has no names.
+        rows = np.arange(len(estimate.names))
+        return rows, rows
     by_name = {name: k for k, name in enumerate(reference.names)}
     by_file: dict[str, list[int]] = {}
     for k, name in enumerate(reference.names):
@@ -86,6 +90,10 @@ def match(estimate: PoseSet, reference: PoseSet) -> tuple[Int, Int]:
         )
     rows = np.array(pairs, np.int64)
     return rows[:, 0], rows[:, 1]
+
+
+def _numbered(poses: PoseSet) -> bool:
+    return all(name == str(k) for k, name in enumerate(poses.names))
 
 
 def _file_name(name: str) -> str:

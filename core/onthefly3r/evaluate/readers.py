@@ -1,4 +1,4 @@
-"""Camera poses from COLMAP text models, TUM files and our own table."""
+"""Camera poses from COLMAP text models, TUM files and our own table; `other_readers.py` has more formats."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from ..errors import ReferenceFormatError
 from ..geometry.arrays import Float
 from ..geometry.frames import world_from_cam_rotation
 from ..geometry.transforms import Rigid3
+from .other_readers import read_arrays, read_colmap_binary, read_kitti, read_nerfstudio
 from .poses import PoseSet, natural_key
 
 POSE_COLUMNS = ("image", "x", "y", "z", "omega", "phi", "kappa")
@@ -25,9 +26,9 @@ POSE_COLUMNS = ("image", "x", "y", "z", "omega", "phi", "kappa")
 def read_poses(path: Path) -> PoseSet:
     """Read camera poses from whatever `path` is.
 
-    A folder may be an output folder of ours (trajectory.csv), a COLMAP text model (images.txt), or hold one in
-    `colmap/`, `sparse/0/` or `sparse/`. A file may be images.txt, a .csv table like ours, or a TUM trajectory
-    (any other name).
+    A folder may be an output folder of ours (trajectory.csv), a COLMAP model (images.txt or images.bin), or hold one
+    in `colmap/`, `sparse/0/` or `sparse/`, or a transforms.json of nerfstudio. A file may be one of these, a .csv table
+    like ours, .npz (names, world_from_cam), or a TUM or KITTI trajectory (any other name).
 
     Raises:
         ReferenceFormatError: missing, not one of these, or wrong in a line that the message names.
@@ -37,8 +38,14 @@ def read_poses(path: Path) -> PoseSet:
         poses = read_trajectory_csv(file)
     elif file.name.lower() == "images.txt":
         poses = read_colmap_images(file)
+    elif file.suffix.lower() == ".bin":
+        poses = read_colmap_binary(file)
+    elif file.suffix.lower() == ".json":
+        poses = read_nerfstudio(file)
+    elif file.suffix.lower() == ".npz":
+        poses = read_arrays(file)
     else:
-        poses = read_tum(file)
+        poses = _read_kitti(file) or read_tum(file)
     if not poses.names:
         raise ReferenceFormatError(f"{file}: holds no camera pose")
     name, times = Counter(poses.names).most_common(1)[0]
@@ -122,6 +129,31 @@ def read_trajectory_csv(path: Path) -> PoseSet:
     return PoseSet.from_poses(path, names, poses)
 
 
+def _read_kitti(path: Path) -> PoseSet | None:
+    """Read a KITTI trajectory, None when the first line is not made of twelve numbers."""
+    rows: list[list[float]] = []
+    for number, line in _lines(path):
+        words = line.split()
+        if not words:
+            continue
+        if len(words) != 12:
+            if not rows:
+                return None
+            raise ReferenceFormatError(f"{path}, line {number}: expected twelve numbers, found {line[:80]!r}")
+        if not rows and not _are_numbers(words):
+            return None
+        rows.append(_floats(path, number, words))
+    return read_kitti(path, rows) if rows else None
+
+
+def _are_numbers(words: Sequence[str]) -> bool:
+    try:
+        [float(word) for word in words]
+    except ValueError:
+        return False
+    return True
+
+
 def scene_depth(path: Path) -> float | None:
     """Return median_scene_depth of the summary.json beside reference poses, in their unit; None where there is none."""
     summary = (path if path.is_dir() else path.parent) / "summary.json"
@@ -140,14 +172,11 @@ def _pose_file(path: Path) -> Path:
         return path
     if not path.exists():
         raise ReferenceFormatError(f"{path}: no such file or folder")
-    for name in ("trajectory.csv", "images.txt", "colmap/images.txt", "sparse/0/images.txt", "sparse/images.txt"):
+    models = [f"{folder}images.{kind}" for folder in ("", "colmap/", "sparse/0/", "sparse/") for kind in ("txt", "bin")]
+    for name in ("trajectory.csv", *models, "transforms.json"):
         if (path / name).is_file():
             return path / name
-    if next(path.glob("**/images.bin"), None) is not None:
-        raise ReferenceFormatError(
-            f"{path}: a binary COLMAP model; convert it with `colmap model_converter --output_type TXT`"
-        )
-    raise ReferenceFormatError(f"{path}: holds neither trajectory.csv nor a COLMAP text model (images.txt)")
+    raise ReferenceFormatError(f"{path}: holds neither trajectory.csv nor a COLMAP model nor transforms.json")
 
 
 def _is_points2d(words: Sequence[str]) -> bool:
