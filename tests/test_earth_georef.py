@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -195,6 +196,66 @@ def test_a_weaving_strip_with_precise_positions_is_no_line() -> None:
     s = survey(2, strips=1, images=20, wander_m=5.0)
     found = georeference(s.map_from_cam, s.shots(s.noise(0.02), sigma_m=0.02), GeoreferenceOptions())
     assert tilt_deg(found, s) < 0.5
+
+
+def wrong(shots: dict[int, Shot], turn: Callable[[Attitude], Attitude]) -> dict[int, Shot]:
+    return {i: replace(s, attitude=turn(s.attitude) if s.attitude else None) for i, s in shots.items()}
+
+
+@pytest.mark.parametrize("with_ground", [True, False])
+@pytest.mark.parametrize("pitch_deg", [-89.0, -75.0])
+def test_a_survey_is_never_upside_down(pitch_deg: float, with_ground: bool) -> None:
+    """Gimbal pitches with the wrong sign say that the cameras look up: they are left out, and it is told."""
+    s = survey(0, pitch_deg=pitch_deg)
+    shots = wrong(s.shots(s.noise(0.5), gimbal=True), lambda a: replace(a, pitch_deg=-a.pitch_deg))
+    found = georeference(s.map_from_cam, shots, GeoreferenceOptions(), s.ground_normal if with_ground else None)
+    assert tilt_deg(found, s) < 6.0
+    assert "gimbal angles" in found.warnings[0] and "left out" in found.warnings[0]
+
+
+def test_angles_that_contradict_ground_and_positions_are_left_out() -> None:
+    """Angles that are 90 degrees off in pitch make a fit impossible that works without them."""
+    s = survey(1, pitch_deg=-88.0)
+    shots = wrong(s.shots(s.noise(0.5), gimbal=True), lambda a: replace(a, yaw_deg=30.0, pitch_deg=-1.0))
+    found = georeference(s.map_from_cam, shots, GeoreferenceOptions(), s.ground_normal)
+    assert tilt_deg(found, s) < 6.0
+    assert "contradict" in found.warnings[0]
+
+
+def test_a_wall_that_is_photographed_from_the_side_keeps_its_angles() -> None:
+    """Cameras that look at a wall: its plane is not the ground, and the gimbal angles are right."""
+    s = survey(0, pitch_deg=-2.0)
+    wall = s.map_from_enu.rotation @ np.array([0.0, -1.0, 0.0])
+    found = georeference(s.map_from_cam, s.shots(s.noise(0.5), gimbal=True), GeoreferenceOptions(), wall)
+    assert tilt_deg(found, s) < 3.0
+    assert not any("gimbal" in warning for warning in found.warnings)
+
+
+def test_a_line_with_mistaken_angles_says_so() -> None:
+    s = survey(2, strips=1, images=20, wander_m=0.5)
+    shots = wrong(s.shots(s.noise(0.5), gimbal=True), lambda a: replace(a, pitch_deg=-a.pitch_deg))
+    with pytest.raises(GeoreferenceError, match=r"along one line.*look up"):
+        georeference(s.map_from_cam, shots, GeoreferenceOptions(), s.ground_normal)
+
+
+def test_places_are_counted_without_their_heights() -> None:
+    """All photographs at one place whose heights differ are one position, not many."""
+    s = survey(0)
+    error = -s.centres * (1.0, 1.0, 0.0)
+    with pytest.raises(GeoreferenceError, match="1 of them different"):
+        georeference(s.map_from_cam, s.shots(error), GeoreferenceOptions(), s.ground_normal)
+
+
+def test_a_minority_of_tags_does_not_decide_what_heights_refer_to() -> None:
+    s = survey(0)
+    shots = s.shots(s.noise(0.3))
+    for i in range(5):
+        fix = shots[i].gps
+        assert fix is not None
+        shots[i] = replace(shots[i], gps=replace(fix, vertical="egm96"))
+    found = georeference(s.map_from_cam, shots, GeoreferenceOptions(), s.ground_normal)
+    assert found.vertical == "unknown"
+    assert any("43 unknown, 5 egm96" in warning and "--vertical" in warning for warning in found.warnings)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

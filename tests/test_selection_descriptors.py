@@ -76,3 +76,15 @@ def test_images_without_texture_stop_nothing() -> None:
     describe.fit(images(empty))
     assert not describe.describe(0, None).any()  # type: ignore[arg-type]
     assert np.linalg.norm(describe.describe(1, None)) == pytest.approx(1.0, abs=1e-5)  # type: ignore[arg-type]
+
+
+def test_few_features_give_no_nan() -> None:
+    """As many features as words: each is a word of its own and leaves no residual."""
+    vectors = np.random.default_rng(0).integers(0, 255, (WORDS, 128)).astype(np.uint8)
+    few = Features(np.zeros((WORDS, 2), np.float32), np.ones(WORDS, np.float32), np.zeros(WORDS, np.float32), vectors)
+    empty = Features(few.pixels[:0], few.scales[:0], few.angles[:0], few.descriptors[:0])
+    of = {0: few, 1: empty, 2: features(0, 0)}
+    describe = describer(of)
+    describe.fit({0: None})  # type: ignore[dict-item]
+    for index in of:
+        assert np.isfinite(describe.describe(index, None)).all()  # type: ignore[arg-type]

@@ -66,3 +66,16 @@ def test_placed_images_are_forgotten_and_no_retries_means_none(retrieval: Retrie
     grow(never, retrieval, [10, 11, 12, 13])
     assert never.take_ready(finishing=True) == []
     assert never.attempts == {15: 1}
+
+
+def test_retries_count_tries_and_not_rejections(retrieval: RetrievalIndex) -> None:
+    queue = RetryQueue(2)
+    queue.set_aside(14, retrieval, 5)
+    assert (queue.attempts, queue.retries) == ({14: 1}, {})
+    queue.take_ready(finishing=True)
+    assert (queue.attempts, queue.retries) == ({14: 1}, {14: 1})
+    queue.set_aside(14, retrieval, 5)
+    assert (queue.attempts, queue.retries) == ({14: 2}, {14: 1})
+    never = RetryQueue(0)
+    never.set_aside(14, retrieval, 5)
+    assert never.take_ready(finishing=True) == [] and never.retries == {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -22,12 +22,15 @@ from ..options import GeoreferenceOptions
 from ..records import GeoReference, Shot
 from .levelfit import LevelFit, fit
 from .positions import Positions, usable_positions
-from .updirection import UpWitness, up_witnesses
+from .updirection import UpWitness, angles_look_up, up_witnesses
 
 MIN_POSITIONS = 3
 LINE_RATIO = 0.02  # sideways over lengthwise extent of camera centres that count as one line
 MAX_ROLL_SIGMA_DEG = 15.0  # what positions must tell about the level in its worst direction to do without gimbal
 GIMBAL = "gimbal angles"
+CONTRADICTION_DEG = 60.0  # between the up of the gimbal angles and that of ground and cameras: one is mistaken,
+UNFOLLOWED_DEG = 30.0  # off the level that was found: angles that had no say
+DECIDED = 0.5  # and it is the angles where the positions scatter this much less without them
 MAX_SCALE_ERROR = 0.002  # of the projection where the survey lies; UTM stays below 0.001 in its zone
 MOST_SCALED = 500  # positions whose distances tell the scale of a local frame,
 FAR_SIGMAS = 5.0  # those that are this much longer than positions are wrong
@@ -58,10 +61,9 @@ def georeference(
     positions = usable_positions(images, shots, options)
     _require_enough(positions, len(images))
     crs = _target_crs(options, positions)
-    first_up, witnesses = up_witnesses(map_from_cam, shots, ground_normal)
     centres = np.array([map_from_cam[i].translation for i in positions.images])
-    solution = fit(centres, positions, first_up, witnesses, seed)
-    _require_trustworthy(solution, centres, witnesses)
+    solution, witnesses, doubts = _levelled(map_from_cam, shots, centres, positions, ground_normal, seed)
+    _require_trustworthy(solution, centres, witnesses, doubts)
     used = solution.inlier_h
     heights = solution.inlier_h & solution.inlier_v
     residuals = {
@@ -80,7 +82,7 @@ def georeference(
         rmse_h_m=float(np.sqrt((solution.residuals[used, :2] ** 2).sum(axis=1).mean())),
         rmse_v_m=float(np.sqrt((solution.residuals[heights, 2] ** 2).mean())) if heights.any() else float("nan"),
         residuals_m=residuals,
-        warnings=(*positions.warnings, *_warnings(solution, positions, crs)),
+        warnings=(*doubts, *positions.warnings, *_warnings(solution, positions, crs)),
     )
 
 
@@ -99,7 +101,40 @@ def _require_enough(positions: Positions, placed: int) -> None:
         )
 
 
-def _require_trustworthy(solution: LevelFit, centres: Float, witnesses: list[UpWitness]) -> None:
+def _levelled(
+    map_from_cam: Mapping[int, Rigid3],
+    shots: Mapping[int, Shot],
+    centres: Float,
+    positions: Positions,
+    ground_normal: Float | None,
+    seed: int,
+) -> tuple[LevelFit, list[UpWitness], list[str]]:
+    """Return the fit, the witnesses of up that it believed, and why gimbal angles were left out where they were."""
+    if angles_look_up(map_from_cam, shots):
+        first_up, witnesses = up_witnesses(map_from_cam, shots, ground_normal, use_angles=False)
+        told = "the gimbal angles say that the cameras look up, but what they photographed lies below them"
+        return fit(centres, positions, first_up, witnesses, seed), witnesses, [f"{told}: the angles were left out"]
+    first_up, witnesses = up_witnesses(map_from_cam, shots, ground_normal)
+    solution = fit(centres, positions, first_up, witnesses, seed)
+    if any(witness.name == GIMBAL for witness in witnesses):
+        other_up, others = up_witnesses(map_from_cam, shots, ground_normal, use_angles=False)
+        if float(first_up @ other_up) < np.cos(np.radians(CONTRADICTION_DEG)):
+            without = fit(centres, positions, other_up, others, seed)
+            if without.sigma_h_m < DECIDED * solution.sigma_h_m:
+                told = "the gimbal angles contradict the ground and the positions"
+                return without, others, [f"{told}: the angles were left out"]
+    up = solution.enu_from_map.rotation[2]
+    off = [float(np.linalg.norm(witness.directions @ up)) for witness in witnesses if witness.name == GIMBAL]
+    if off and off[0] > np.sin(np.radians(UNFOLLOWED_DEG)):
+        return (
+            solution,
+            witnesses,
+            ["the gimbal angles contradict the ground and the positions: they were not followed"],
+        )
+    return solution, witnesses, []
+
+
+def _require_trustworthy(solution: LevelFit, centres: Float, witnesses: list[UpWitness], doubts: Sequence[str]) -> None:
     scaled = solution.enu_from_map.scale * (centres - centres.mean(axis=0))
     lengthwise, sideways, _ = np.linalg.svd(scaled, compute_uv=False) / np.sqrt(len(scaled))
     enu = solution.enu_from_map.apply(centres)[:, :2]
@@ -116,8 +151,8 @@ def _require_trustworthy(solution: LevelFit, centres: Float, witnesses: list[UpW
     if on_a_line and all(witness.name != GIMBAL for witness in witnesses):
         raise GeoreferenceError(
             f"the positions lie along one line ({lengthwise:.1f} m lengthwise, {sideways:.2f} m sideways, rms) and no "
-            "photograph has gimbal angles: the roll about the line stays open. Add a parallel or crossing strip, or "
-            "ask for local coordinates (--local)"
+            f"photograph has gimbal angles{' to believe (' + doubts[0] + ')' if doubts else ''}: the roll about the "
+            "line stays open. Add a parallel or crossing strip, or ask for local coordinates (--local)"
         )
 
 

@@ -63,16 +63,17 @@ def usable_positions(images: Sequence[int], shots: Mapping[int, Shot], options: 
     centre_lon = (float(np.median(lon)) + 180.0) % 360.0 - 180.0
     frame = EnuFrame(float(np.median(lat)), centre_lon, float(np.median(height)))
     times = [shots[i].time_s for i in images]
-    key = [(fix.lat_deg, fix.lon_deg, fix.height_m) for fix in fixes]
+    key = [(round(fix.lat_deg, 9), round(fix.lon_deg, 9)) for fix in fixes]  # whatever the heights
     count = Counter(key)
     repeats = np.sqrt([count[k] for k in key])
     if len(count) < len(key):
         warnings.append(f"{len(key)} photographs share {len(count)} positions: repeated ones count once")
+    noise_m = np.array([position_noise_m(fix, options) for fix in fixes])
     return Positions(
         images=images,
         enu=frame.from_geographic(np.stack([lat, lon, height], axis=-1)),
-        sigma_h_m=repeats * [fix.sigma_h_m or options.gps_sigma_h_m for fix in fixes],
-        sigma_v_m=repeats * [fix.sigma_v_m or options.gps_sigma_v_m for fix in fixes],
+        sigma_h_m=repeats * noise_m[:, 0],
+        sigma_v_m=repeats * noise_m[:, 1],
         has_height=has_height,
         flight=_flights(times),
         order=np.argsort([np.inf if t is None else t for t in times], kind="stable"),
@@ -83,19 +84,40 @@ def usable_positions(images: Sequence[int], shots: Mapping[int, Shot], options: 
     )
 
 
+def position_noise_m(fix: GpsFix, options: GeoreferenceOptions) -> tuple[float, float]:
+    """Return the standard deviations (m) of a position, horizontal per axis and vertical: stated, else the options'.
+
+    The only noise model of positions: all stages that weigh them ask here.
+    """
+    return fix.sigma_h_m or options.gps_sigma_h_m, fix.sigma_v_m or options.gps_sigma_v_m
+
+
 def _one_vertical_reference(
     fixes: list[GpsFix], options: GeoreferenceOptions
 ) -> tuple[list[GpsFix], VerticalReference, list[str]]:
-    """Decide what the heights refer to: the option, else what most tags say; unknown ones join the majority."""
+    """Decide what the heights refer to: the option, else what most tags say; a minority does not decide for the rest.
+
+    Where most tags agree, known references are converted to theirs and unknown ones taken for it.
+    """
     if options.vertical != "auto":
         return [replace(fix, vertical=options.vertical) for fix in fixes], options.vertical, []
     said = Counter(fix.vertical for fix in fixes if fix.height_m is not None)
+    if not said:
+        return fixes, "unknown", []
     known = [v for v, _ in said.most_common() if v not in ("unknown", "relative")]
-    vertical: VerticalReference = known[0] if known else "unknown"
+    sure = sum(said[v] for v in known) > 0.5 * said.total()
+    vertical: VerticalReference = known[0] if known and sure else "unknown"
     warnings = []
     if len(said) > 1:
         text = ", ".join(f"{n} {v}" for v, n in said.most_common())
-        warnings.append(f"heights of different references ({text}) are brought to {vertical}; check with --vertical")
+        warnings.append(
+            f"the heights have different references ({text}) and are brought to {vertical}; check with --vertical"
+            if sure
+            else f"most heights do not say what they refer to ({text}): all are taken as they are, and the reference "
+            "is called unknown; name it with --vertical"
+        )
+    if not sure:
+        return [replace(fix, vertical="unknown") for fix in fixes], vertical, warnings
     return [f if f.vertical in known else replace(f, vertical=vertical) for f in fixes], vertical, warnings
 
 

@@ -21,6 +21,7 @@ GROUND_SIGMA_DEG = 5.0  # natural slope of the ground under a survey
 LEVEL_SIGMA_DEG = 4.0  # the image's horizontal edge against the horizon
 NADIR_SIGMA_DEG = 10.0  # mean viewing direction against straight down
 WITNESS_CORE = 4.0  # squared sigmas beyond which a witness counts as mistaken
+LOOKS_UP = 0.34  # sine of the angle above the horizon (20 degrees) at which cameras of a survey do not look
 MAX_AXIS_SPREAD_DEG = 40.0  # beyond this viewing directions tell nothing about nadir
 
 
@@ -34,17 +35,28 @@ class UpWitness:
 
 
 def up_witnesses(
-    map_from_cam: Mapping[int, Rigid3], shots: Mapping[int, Shot], ground_normal: Float | None
+    map_from_cam: Mapping[int, Rigid3],
+    shots: Mapping[int, Shot],
+    ground_normal: Float | None,
+    use_angles: bool = True,
 ) -> tuple[Float, list[UpWitness]]:
     """Return a first up vector (3,) in the map frame and the witnesses behind it.
 
-    `ground_normal` points away from the ground (up). With gimbal angles, the habits of drone cameras (level
-    image edge, mean view to nadir) are left out.
+    The points lie before the cameras: that side is down, and gimbal angles which say that the cameras look up at them
+    do not count. With gimbal angles, the habits of drone cameras (level image edge, mean view to nadir) are left out.
+
+    Args:
+        map_from_cam: poses of the placed cameras, map frame.
+        shots: their tags.
+        ground_normal: (3,) away from the ground (up), map frame; None if unknown.
+        use_angles: whether gimbal angles may speak.
     """
     images = sorted(map_from_cam)
-    gimbal = _gimbal_up(images, map_from_cam, shots)
+    gimbal = _gimbal_up(images, map_from_cam, shots) if use_angles else None
+    if gimbal is not None and _looks_up(gimbal[0], map_from_cam):
+        gimbal = None
     witnesses: list[UpWitness] = []
-    sign = -np.mean([map_from_cam[i].rotation[:, 2] for i in images], axis=0)
+    sign = -_mean_view(map_from_cam)
     if ground_normal is not None:
         ground = np.asarray(ground_normal, float) / float(np.linalg.norm(ground_normal))
         witnesses.append(_vector_witness("ground plane", ground, GROUND_SIGMA_DEG))
@@ -55,6 +67,20 @@ def up_witnesses(
     else:
         witnesses += _habits(np.array([map_from_cam[i].rotation for i in images]))
     return fuse(witnesses, sign), witnesses
+
+
+def angles_look_up(map_from_cam: Mapping[int, Rigid3], shots: Mapping[int, Shot]) -> bool:
+    """Return whether there are gimbal angles and they say that the cameras look up at what they photograph."""
+    gimbal = _gimbal_up(sorted(map_from_cam), map_from_cam, shots)
+    return gimbal is not None and _looks_up(gimbal[0], map_from_cam)
+
+
+def _looks_up(up: Float, map_from_cam: Mapping[int, Rigid3]) -> bool:
+    return float(up @ _mean_view(map_from_cam)) > LOOKS_UP
+
+
+def _mean_view(map_from_cam: Mapping[int, Rigid3]) -> Float:
+    return np.asarray(np.mean([pose.rotation[:, 2] for pose in map_from_cam.values()], axis=0))
 
 
 def fuse(witnesses: Sequence[UpWitness], sign: Float) -> Float:

@@ -116,8 +116,8 @@ class Engine:
 
     @property
     def retries(self) -> dict[int, int]:
-        """How often each image was rejected that ever was."""
-        return self._retry.attempts
+        """How often each image was tried again that ever was."""
+        return self._retry.retries
 
     def details(self) -> dict[str, Any]:
         """Return figures of the run for the report."""

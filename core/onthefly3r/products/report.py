@@ -54,6 +54,23 @@ class RunSummary:
     stage_memory: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # peaks by stage, MiB
 
 
+def attention(placed: int, given: int, georeference: GeoReference | None) -> list[str]:
+    """Return what must be known before anything else: that much of the input is not in the result, or is doubted."""
+    told = []
+    if 2 * placed <= given and placed:
+        told.append(
+            f"only {placed} of {given} photographs are in the result: the rest did not fit together, or overlaps too "
+            "little; the report lists why"
+        )
+    positions = len(georeference.residuals_m) or georeference.n_used if georeference else 0
+    if georeference and 3 * georeference.n_outliers >= positions > 0:
+        told.append(
+            f"{georeference.n_outliers} of {positions} positions disagree with the map: where it lies on the Earth is "
+            "doubtful; check the positions in the tags or in the position file"
+        )
+    return told
+
+
 def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
     """Return the report as JSON values: numbers that are not finite become None, paths their file name."""
     geo, cloud, timing = run.georeference, run.cloud, run.timing
@@ -97,7 +114,7 @@ def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
         },
         "memory": {"peak_rss_mib": peak_rss_mib, "stages": dict(run.stage_memory)},
         "error": run.error,
-        "warnings": [*run.warnings, *(geo.warnings if geo else ())],
+        "warnings": [*attention(run.placed, run.given, geo), *run.warnings, *(geo.warnings if geo else ())],
         "details": dict(run.details),
     }
     return dict(_plain(report))

@@ -63,8 +63,8 @@ class VladDescriber:
             members = vectors[word == k]
             residual[k] = members.sum(axis=0) - len(members) * self._words[k]
         residual /= np.maximum(np.linalg.norm(residual, axis=1, keepdims=True), 1e-12)
-        flat = residual.ravel()
-        return np.asarray(flat / np.linalg.norm(flat), np.float32)
+        flat = residual.ravel()  # all zeros where every feature is a word itself
+        return np.asarray(flat / max(float(np.linalg.norm(flat)), 1e-12), np.float32)
 
 
 def _unit(descriptors: Float | UInt8) -> Float:

@@ -19,10 +19,14 @@ class _Aside:
 
 
 class RetryQueue:
-    """Decides when a rejected image is worth another try; `attempts` counts the rejections of each image."""
+    """Decides when a rejected image is worth another try.
+
+    `attempts` counts the rejections of each image, `retries` how often it was tried again.
+    """
 
     def __init__(self, max_retries: int) -> None:
         self.attempts: dict[int, int] = {}
+        self.retries: dict[int, int] = {}
         self._max_retries = max_retries
         self._aside: dict[int, _Aside] = {}
 
@@ -64,4 +68,5 @@ class RetryQueue:
         ready = [index for index, aside in self._aside.items() if is_ready(index, aside)]
         for index in ready:
             del self._aside[index]
+            self.retries[index] = self.retries.get(index, 0) + 1
         return sorted(ready, key=lambda i: (self.attempts[i], i))
