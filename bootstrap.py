@@ -58,6 +58,26 @@ class SetupError(Exception):
     """The environment cannot be made; the message says how to mend it."""
 
 
+def without_builds(system: str, machine: str) -> str:
+    """Return what to do where a package that the work needs has no build, empty where all are to be had.
+
+    `system` and `machine` are those of the module `platform`; README's table of platforms says the same.
+    """
+    machine = machine.lower()
+    if (system, machine) == ("Darwin", "x86_64"):
+        remedy = "use a Mac with Apple silicon, Windows or Linux on x86_64"
+    elif system == "Linux" and machine not in ("x86_64", "amd64"):
+        remedy = "use Linux on x86_64"
+    elif system == "Windows" and machine not in ("x86_64", "amd64"):
+        remedy = "use a Python for x86_64, which Windows on ARM runs too"
+    else:
+        return ""
+    return (
+        f"pycolmap has no ready build for {system} on {machine}, and reconstruction requires it: {remedy}, "
+        "or build pycolmap from its source into the environment."
+    )
+
+
 def say(message: str) -> None:
     """Print a line at once, whatever the console's encoding."""
     encoding = sys.stdout.encoding or "utf-8"
@@ -389,6 +409,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         say(f"Python {OLDEST_PYTHON[0]}.{OLDEST_PYTHON[1]} or newer is needed; this is {platform.python_version()}.")
         return 2
     environment = ROOT / ".venv"
+    if chosen.verb != "package" and (warning := without_builds(platform.system(), platform.machine())):
+        say(warning)
     try:
         if chosen.verb == "setup":
             return setup(environment, chosen.rest)

@@ -325,6 +325,34 @@ def test_missing_libraries_come_from_doctor(bootstrap: ModuleType, monkeypatch: 
     assert bootstrap.missing_system_libraries(Path("python")) == ["open3d: sudo apt-get install libgl1"]
 
 
+@pytest.mark.parametrize(
+    ("system", "machine", "told"),
+    [
+        ("Windows", "AMD64", ""),
+        ("Linux", "x86_64", ""),
+        ("Darwin", "arm64", ""),
+        ("Darwin", "x86_64", "Apple silicon"),
+        ("Linux", "aarch64", "Linux on x86_64"),
+        ("Windows", "ARM64", "Python for x86_64"),
+    ],
+)
+def test_the_first_line_says_what_cannot_be_had(
+    system: str,
+    machine: str,
+    told: str,
+    bootstrap: ModuleType,
+    calls: list[list[str]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(bootstrap.platform, "system", lambda: system)
+    monkeypatch.setattr(bootstrap.platform, "machine", lambda: machine)
+    bootstrap.main(["run", "photographs", "out"])
+    first = capsys.readouterr().out.partition("\n")[0]
+    assert told in first
+    assert ("pycolmap" in first) == bool(told)
+
+
 def test_script_needs_only_the_standard_library() -> None:
     script = (
         "import sys\nbefore = set(sys.modules)\nimport bootstrap\n"

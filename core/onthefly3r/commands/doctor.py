@@ -35,7 +35,7 @@ class Package:
     distribution: str
     module: str
     extra: str = ""
-    absent_on: str = ""  # sys.platform without a build
+    stand_in: str = ""  # what does its work where it is missing
 
 
 PACKAGES = (
@@ -43,7 +43,7 @@ PACKAGES = (
     Package("scipy", "scipy"),
     Package("opencv-python-headless", "cv2"),
     Package("pycolmap", "pycolmap"),
-    Package("gtsam", "gtsam", absent_on="win32"),
+    Package("gtsam", "gtsam", stand_in="the solver on scipy"),
     Package("pyproj", "pyproj"),
     Package("laspy", "laspy"),
     Package("pyshp", "shapefile"),
@@ -130,7 +130,7 @@ def examine(folder: Path) -> list[Check]:
 def check_package(package: Package) -> Check:
     """Import one package in a process of its own."""
     remedy = _install_command(package)
-    harmless: Status = "note" if package.extra or package.absent_on == sys.platform else "missing"
+    harmless: Status = "note" if package.extra or package.stand_in else "missing"
     if importlib.util.find_spec(package.module) is None:
         where = f" (extra {package.extra})" if package.extra else ""
         return Check(package.distribution, harmless, f"not installed{where}", remedy)
@@ -221,8 +221,8 @@ def _last_words(ran: subprocess.CompletedProcess[str]) -> str:
 
 
 def _install_command(package: Package) -> str:
-    if package.absent_on == sys.platform:
-        return f"{package.distribution} has no build for this system; what needs it says so"
+    if package.stand_in:
+        return f"not needed: {package.stand_in} does its work, with the same result"
     if package.extra:
         return f'pip install "onthefly3r[{package.extra}]"'
     return f"pip install {package.distribution}"
