@@ -88,3 +88,14 @@ def test_few_features_give_no_nan() -> None:
     describe.fit({0: None})  # type: ignore[dict-item]
     for index in of:
         assert np.isfinite(describe.describe(index, None)).all()  # type: ignore[arg-type]
+
+
+def test_an_image_whose_features_are_words_themselves_is_like_no_other() -> None:
+    """Few features, all the same: each lies on its word and leaves no residual."""
+    one = features(0, 0, count=1)
+    same = np.repeat(one.descriptors[:1], 100, axis=0)
+    every = Features(np.zeros((100, 2), np.float32), np.ones(100, np.float32), np.zeros(100, np.float32), same)
+    known = {0: every, 1: every}
+    describe = describer(known)
+    describe.fit(images(known))
+    assert not describe.describe(0, None).any()  # type: ignore[arg-type]

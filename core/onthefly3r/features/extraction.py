@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import os
-import tempfile
 import threading
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
 from ..files.array_file import ArrayFile
-from ..geometry.arrays import Float, UInt8
+from ..geometry.arrays import UInt8
 from ..records import Features, WorkingImage
-from .pycolmap_module import load_pycolmap
+from .keypoints import find_keypoints, scale_space
+from .rootsift import describe
 
 CACHED_IMAGES = 128  # about 0.6 MB each
 
@@ -22,62 +23,22 @@ CACHED_IMAGES = 128  # about 0.6 MB each
 def extract_features(images: Sequence[UInt8], max_features: int, threads: int) -> list[Features]:
     """Return RootSIFT features (Lowe 2004, Arandjelovic & Zisserman 2012) of RGB images (H, W, 3).
 
-    The first octave is the image itself, not its double: on drone photographs reduced to working size the
-    doubled octave costs four times as much and adds few matches.
+    They come best spread first: any so many of the first are spread over the image as all are.
     """
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        return list(pool.map(lambda rgb: _features(rgb, max_features), images))
+
+
+def _features(rgb: UInt8, max_features: int) -> Features:
     import cv2
 
-    pycolmap = load_pycolmap()
-
-    # Through files, because only this way in lets several threads extract at once: `FeatureExtractor.extract` keeps
-    # the interpreter locked. The names and the folder's are plain ASCII wherever the system's own temporary folder is.
-    with tempfile.TemporaryDirectory(prefix="onthefly3r-") as folder:
-        names = [f"{number:06d}.pgm" for number in range(len(images))]
-        for name, rgb in zip(names, images, strict=True):
-            height, width = rgb.shape[:2]
-            grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-            (Path(folder) / name).write_bytes(b"P5 %d %d 255\n" % (width, height) + grey.tobytes())
-        options = pycolmap.FeatureExtractionOptions()
-        options.num_threads = threads
-        options.max_image_size = max(max(rgb.shape) for rgb in images)  # as it is, never reduced
-        options.sift.max_num_features = max_features
-        options.sift.first_octave = 0
-        path = Path(folder) / "features.db"
-        pycolmap.extract_features(
-            path,
-            folder,
-            image_names=names,
-            camera_mode=pycolmap.CameraMode.PER_IMAGE,
-            extraction_options=options,
-            device=pycolmap.Device.cpu,
-        )
-        database = pycolmap.Database.open(path)
-        try:
-            image_id = {image.name: image.image_id for image in database.read_all_images()}
-            return [
-                _features(
-                    database.read_keypoints(image_id[name]),
-                    database.read_descriptors(image_id[name]).data,
-                    max_features,
-                )
-                for name in names
-            ]
-        finally:
-            database.close()  # before the folder goes
-
-
-def _features(keypoints: Float, descriptors: UInt8, max_features: int) -> Features:
-    """Return the largest features; keypoints (N, 6) are x, y and the affine shape by rows."""
-    shape = np.asarray(keypoints, np.float32).reshape(-1, 6)
-    scales = np.hypot(shape[:, 2], shape[:, 4])
-    # The extractor stops at whole levels of the scale space and may give twice as many.
-    largest = np.argsort(-scales, kind="stable")[:max_features]
-    return Features(
-        pixels=shape[largest, :2],
-        scales=scales[largest],
-        angles=np.arctan2(shape[largest, 4], shape[largest, 2]),
-        descriptors=np.asarray(descriptors, np.uint8).reshape(-1, 128)[largest],
-    )
+    grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+    octaves = scale_space(grey)
+    height, width = grey.shape
+    keypoints = find_keypoints(octaves, (height, width), max_features)
+    angles, descriptors = describe(octaves, keypoints)
+    # Pixels count from the corner of the first one, as everywhere else.
+    return Features(keypoints.pixels() + np.float32(0.5), keypoints.scales(), angles, descriptors)
 
 
 class FeatureStore:

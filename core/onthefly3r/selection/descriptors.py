@@ -12,6 +12,7 @@ from .describer import LocalFeatures
 
 WORDS = 64
 TRAINING_FEATURES = 40_000
+MIN_RESIDUAL = 1e-4  # of unit vectors, summed over the features of a word
 
 
 class VladDescriber:
@@ -50,7 +51,7 @@ class VladDescriber:
         self._words = np.asarray(words, np.float32)
 
     def describe(self, index: int, image: WorkingImage) -> Float:
-        """Return the L2-normalised descriptor (8192,) float32; zeros for an image without features."""
+        """Return the L2-normalised descriptor (8192,) float32; zeros for an image without features, or whose features are words."""
         if self._words is None:
             raise RuntimeError("describe() before fit()")
         vectors = _unit(self.features.features_of(index, image).descriptors)
@@ -62,9 +63,11 @@ class VladDescriber:
         for k in np.unique(word):
             members = vectors[word == k]
             residual[k] = members.sum(axis=0) - len(members) * self._words[k]
-        residual /= np.maximum(np.linalg.norm(residual, axis=1, keepdims=True), 1e-12)
-        flat = residual.ravel()  # all zeros where every feature is a word itself
-        return np.asarray(flat / max(float(np.linalg.norm(flat)), 1e-12), np.float32)
+        length = np.linalg.norm(residual, axis=1, keepdims=True)
+        # A residual as short as what rounding leaves tells nothing: its word counts as not seen.
+        residual = np.where(length > MIN_RESIDUAL, residual / np.maximum(length, MIN_RESIDUAL), np.float32(0.0))
+        flat = residual.ravel()
+        return np.asarray(flat / max(float(np.linalg.norm(flat)), 1.0), np.float32)
 
 
 def _unit(descriptors: Float | UInt8) -> Float:
