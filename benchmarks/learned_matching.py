@@ -9,10 +9,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import itertools
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,9 @@ from onthefly3r.backbones.classical import ClassicalBackbone
 from onthefly3r.errors import ReconstructionError
 from onthefly3r.evaluate.comparison import evaluate
 from onthefly3r.features.matching import PairMatcher
-from onthefly3r.features.pycolmap_module import load_pycolmap
-from onthefly3r.geometry.arrays import Float
+from onthefly3r.features.pycolmap_module import load_pycolmap, to_pycolmap_camera
+from onthefly3r.geometry.arrays import Float, Int
+from onthefly3r.geometry.camera import Camera
 from onthefly3r.options import BackboneOptions, Options
 from onthefly3r.records import Features, WorkingImage
 from onthefly3r.run.session import reconstruct
@@ -80,25 +82,48 @@ class LearnedMatcher(PairMatcher):
             self._network = LighterGlue().eval()
         self._match = self._lighterglue if lighterglue else self._mutual
 
-    def _match_pair(self, first: Features, camera1: Any, second: Features, camera2: Any) -> Any:  # type: ignore[override]
+    def match(
+        self,
+        features: Mapping[int, Features],
+        cameras: Mapping[int, Camera],
+        calibrated: Mapping[int, bool],
+        members: Sequence[int],
+        checkpoint: Callable[[], None] = lambda: None,
+    ) -> dict[tuple[int, int], Int]:
+        """Return the verified matches of all pairs, one after the other."""
+        pairs = [(min(p), max(p)) for p in itertools.combinations(members, 2)]
+        for pair in pairs:
+            checkpoint()
+            if pair not in self._recent:
+                first, second = pair
+                self._recent[pair] = self._verified(features[first], features[second], cameras[first], cameras[second])
+        return {pair: self._recent[pair] for pair in pairs}
+
+    def _verified(self, first: Features, second: Features, camera1: Camera, camera2: Camera) -> Int:
         pycolmap = load_pycolmap()
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.random_seed = 0
         matches = self._match(first, camera1, second, camera2).astype(np.uint32)
         if len(matches) < options.min_num_inliers:
-            return pycolmap.TwoViewGeometry()
-        return pycolmap.estimate_two_view_geometry(
-            camera1, first.pixels.astype(np.float64), camera2, second.pixels.astype(np.float64), matches, options
+            return np.zeros((0, 2), np.int64)
+        geometry = pycolmap.estimate_two_view_geometry(
+            to_pycolmap_camera(camera1, 1),
+            first.pixels.astype(np.float64),
+            to_pycolmap_camera(camera2, 2),
+            second.pixels.astype(np.float64),
+            matches,
+            options,
         )
+        return np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
 
-    def _mutual(self, first: Features, camera1: Any, second: Features, camera2: Any) -> Float:
+    def _mutual(self, first: Features, camera1: Camera, second: Features, camera2: Camera) -> Float:
         similarity = np.asarray(first.descriptors) @ np.asarray(second.descriptors).T
         best = similarity.argmax(axis=1)
         rows = np.arange(len(best))
         good = (similarity.argmax(axis=0)[best] == rows) & (similarity[rows, best] > MIN_COSINE)
         return np.column_stack([rows[good], best[good]])
 
-    def _lighterglue(self, first: Features, camera1: Any, second: Features, camera2: Any) -> Float:
+    def _lighterglue(self, first: Features, camera1: Camera, second: Features, camera2: Camera) -> Float:
         import torch
 
         data = {}

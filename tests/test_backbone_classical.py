@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from onthefly3r.backbones.classical import ClassicalBackbone
+from onthefly3r.features import matching
 from onthefly3r.features.extraction import FeatureStore
-from onthefly3r.features.matching import PairMatcher, mutual_matches
+from onthefly3r.features.matching import PairMatcher
 from onthefly3r.geometry.camera import Camera, PixelMap
 from onthefly3r.geometry.transforms import Sim3, rotation_angle_deg
 from onthefly3r.geometry.umeyama import weighted_similarity
@@ -164,27 +165,18 @@ def test_subset_without_overlap_is_rejected_with_numbers(case: Case, tmp_path: P
 
 def test_a_pair_is_matched_once(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
-    once = PairMatcher._match_pair
+    once = matching.verified_matches
 
     def counted(*pair: object) -> object:
         asked.append(pair)
         return once(*pair)
 
-    monkeypatch.setattr(PairMatcher, "_match_pair", staticmethod(counted))
+    monkeypatch.setattr(matching, "verified_matches", counted)
     matcher = PairMatcher(1)
     features = {i: case.backbone.features_of(i, case.images[i]) for i in range(4)}
     cameras: dict[int, Camera] = dict.fromkeys(features, case.survey.views[0].camera)
-    first = matcher.match(features, cameras, (0, 1, 2))
-    again = matcher.match(features, cameras, (3, 2, 1))
+    calibrated = dict.fromkeys(features, True)
+    first = matcher.match(features, cameras, calibrated, (0, 1, 2))
+    again = matcher.match(features, cameras, calibrated, (3, 2, 1))
     assert len(asked) == 5
     assert set(first) == {(0, 1), (0, 2), (1, 2)} and again[1, 2] is first[1, 2]
-
-
-def test_matches_are_mutual_and_unambiguous(case: Case) -> None:
-    first, second = (case.backbone.features_of(i, case.images[i]) for i in (0, 1))
-    matches = mutual_matches(first, second)
-    assert len(matches) > 100
-    assert len(np.unique(matches[:, 0])) == len(np.unique(matches[:, 1])) == len(matches)
-    swapped = mutual_matches(second, first)
-    agreed = {tuple(pair) for pair in matches.tolist()} & {(b, a) for a, b in swapped.tolist()}
-    assert len(agreed) > 0.8 * len(matches)

@@ -62,12 +62,18 @@ class ClassicalBackbone:
         features = {i: self.features_of(i, images[i]) for i in members}
         keys = {i: images[i].shot.camera_key for i in members}
         cameras = {keys[i]: _working_camera(images[i], calibrations) for i in members}
-        geometries = self._matcher.match(features, {i: cameras[keys[i]] for i in members}, members, self._checkpoint)
         held = frozenset(key for key in cameras if key in calibrations)
-        model = local_sfm(features, keys, cameras, held, geometries, self._threads, self._checkpoint)
+        matches = self._matcher.match(
+            features,
+            {i: cameras[keys[i]] for i in members},
+            {i: keys[i] in held for i in members},
+            members,
+            self._checkpoint,
+        )
+        model = local_sfm(features, keys, cameras, held, matches, self._threads, self._checkpoint)
         self._checkpoint()
         if model is None:
-            verified = sum(len(g.inlier_matches) > 0 for g in geometries.values())
+            verified = sum(len(found) > 0 for found in matches.values())
             numbers = {"images": float(len(members)), "verified_pairs": float(verified)}
             return Rejection(subset.new, "backbone", "too little overlap to reconstruct the subset", numbers)
         if not held >= set(cameras) and len(model.local_from_cam) >= MIN_IMAGES_TO_CALIBRATE:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ..adjust.sparse_model import SparseModel, Track
-from ..features.matching import to_pycolmap_camera
-from ..features.pycolmap_module import load_pycolmap
+from ..features.pycolmap_module import load_pycolmap, to_pycolmap_camera
+from ..geometry.arrays import Int
 from ..geometry.camera import Camera
 from ..geometry.transforms import Rigid3
 from ..records import Features
@@ -22,19 +22,20 @@ def local_sfm(
     keys: Mapping[int, str],
     cameras: Mapping[str, Camera],
     held: frozenset[str],
-    geometries: Mapping[tuple[int, int], Any],
+    matches: Mapping[tuple[int, int], Int],
     threads: int,
     checkpoint: Callable[[], None] = lambda: None,
 ) -> SparseModel | None:
     """Return the largest model of the subset, or None when no three images hold together.
 
-    Intrinsics of the camera keys in `held` stay as given; the others are refined in the bundle adjustment.
+    `matches` are the verified ones (M, 2) of image pairs, rows of their features. Intrinsics of the camera keys in
+    `held` stay as given; the others are refined in the bundle adjustment.
     `checkpoint` is called after every image that was added; what it raises ends the work.
     """
     pycolmap = load_pycolmap()
 
     camera_ids = {key: number for number, key in enumerate(sorted(cameras), start=1)}
-    cache = _database_cache(features, keys, cameras, camera_ids, geometries)
+    cache = _database_cache(features, keys, cameras, camera_ids, matches)
     options = _pipeline_options(threads)
     options.constant_cameras = {camera_ids[key] for key in held if key in camera_ids}
     manager = pycolmap.ReconstructionManager()
@@ -54,7 +55,7 @@ def _database_cache(
     keys: Mapping[int, str],
     cameras: Mapping[str, Camera],
     camera_ids: Mapping[str, int],
-    geometries: Mapping[tuple[int, int], Any],
+    matches: Mapping[tuple[int, int], Int],
 ) -> Any:
     pycolmap = load_pycolmap()
 
@@ -75,8 +76,11 @@ def _database_cache(
         frame.add_data_id(pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id), image_id))
         database.write_frame(frame, use_frame_id=True)
         database.write_keypoints(image_id, image_features.pixels)
-    for (first, second), geometry in geometries.items():
-        if len(geometry.inlier_matches):
+    for (first, second), pairs in matches.items():
+        if len(pairs):
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.inlier_matches = pairs.astype(np.uint32)
             database.write_two_view_geometry(first + 1, second + 1, geometry)
     cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
     database.close()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -92,7 +93,7 @@ def _extrema(levels: Sequence[Float]) -> Float:
     """Return x, y, layer, level, contrast (N, 5) float32 of the extrema of one octave, refined by a parabola."""
     import cv2
 
-    difference = np.stack([cv2.subtract(finer, coarser) for coarser, finer in zip(levels, levels[1:], strict=False)])
+    difference = np.stack([cv2.subtract(finer, coarser) for coarser, finer in pairwise(levels)])
     _, height, width = difference.shape
     flat = difference.ravel()
     block = np.ones((3, 3), np.uint8)

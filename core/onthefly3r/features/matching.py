@@ -1,4 +1,9 @@
-"""Pairwise matching and geometric verification of the images of one subset."""
+"""Verified matches of image pairs: a few features tell how two images lie to each other, the rest is looked up.
+
+The features that come first are spread over the image: their mutual neighbours give the epipolar geometry. All
+features are then compared within their epipolar planes alone, which costs less than comparing each with each, and
+finds more. Descriptors hold whole numbers, so their products are exact, whatever the number of threads.
+"""
 
 from __future__ import annotations
 
@@ -6,110 +11,156 @@ import itertools
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 
-from ..geometry.arrays import Float, Int
+from ..geometry.arrays import Bool, Float, Int
 from ..geometry.camera import Camera
 from ..records import Features
-from .pycolmap_module import load_pycolmap
+from .epipolar import guided_neighbours, relative_geometry
+from .rootsift import NORM
 
 CACHED_PAIRS = 4000
-DESCRIPTOR_NORM = 512.0  # pycolmap stores unit RootSIFT vectors times 512 as bytes
+FIRST_FEATURES = 1000
 MAX_RATIO = 0.8
 MAX_DISTANCE = 0.7
-MIN_TRIALS = 30  # of RANSAC; most pairs of a subset have so many inliers that these suffice
+MIN_INLIERS = 15
+# Inliers among the first features: with fewer, all features are compared with all, unless so few of the first ones
+# match at all that the images cannot overlap.
+WEAK_PAIR, MIN_HINTS = 30, 8
+MAX_MATCHES = 300  # of a pair
+# How far a match may lie from its epipolar line. A focal length that is only a prior bends the lines: a narrow band
+# would keep what agrees with the wrong one.
+BAND_PX, PRIOR_BAND_PX = 1.0, 3.0
+SCALE_FACTOR, TURN_RAD = 1.5, 0.6  # from how the pair's features usually change scale and turn
 
 
 class PairMatcher:
-    """Verified two-view geometries by image pair; a pair that two subsets share is matched once."""
+    """Verified matches by image pair; a pair that two subsets share is matched once."""
 
     def __init__(self, threads: int) -> None:
         self._threads = threads
-        self._recent: OrderedDict[tuple[int, int], Any] = OrderedDict()
+        self._recent: OrderedDict[tuple[int, int], Int] = OrderedDict()
 
     def match(
         self,
         features: Mapping[int, Features],
         cameras: Mapping[int, Camera],
+        calibrated: Mapping[int, bool],
         members: Sequence[int],
         checkpoint: Callable[[], None] = lambda: None,
-    ) -> dict[tuple[int, int], Any]:
-        """Return pycolmap two-view geometries of all pairs (i < j) of the members, indices into their features.
+    ) -> dict[tuple[int, int], Int]:
+        """Return the verified matches (M, 2) of all pairs (i < j) of the members, rows of their features.
 
-        `checkpoint` is called between pairs; what it raises ends the work.
+        `calibrated` tells whose camera is more than a prior. A pair that fails has no matches. `checkpoint` is called
+        between pairs; what it raises ends the work.
         """
         pairs = [(min(p), max(p)) for p in itertools.combinations(members, 2)]
         missing = [pair for pair in pairs if pair not in self._recent]
-        made = {i: to_pycolmap_camera(cameras[i], 1) for i in members}
+        sides = {i: Side(features[i], cameras[i]) for i in sorted({i for pair in missing for i in pair})}
         with ThreadPoolExecutor(self._threads) as pool:
-            geometries = pool.map(
-                lambda pair: self._match_pair(features[pair[0]], made[pair[0]], features[pair[1]], made[pair[1]]),
+            found = pool.map(
+                lambda pair: verified_matches(
+                    sides[pair[0]],
+                    sides[pair[1]],
+                    BAND_PX if calibrated[pair[0]] and calibrated[pair[1]] else PRIOR_BAND_PX,
+                ),
                 missing,
             )
             try:
-                for pair, geometry in zip(missing, geometries, strict=True):
-                    self._recent[pair] = geometry
+                for pair, verified in zip(missing, found, strict=True):
+                    self._recent[pair] = verified
                     checkpoint()
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)  # else the end of `with` waits for all pairs
                 raise
-        found = {}
+        matches = {}
         for pair in pairs:
             self._recent.move_to_end(pair)
-            found[pair] = self._recent[pair]
+            matches[pair] = self._recent[pair]
         while len(self._recent) > max(CACHED_PAIRS, len(pairs)):
             self._recent.popitem(last=False)
-        return found
+        return matches
 
-    @staticmethod
-    def _match_pair(first: Features, camera1: Any, second: Features, camera2: Any) -> Any:
-        pycolmap = load_pycolmap()
 
-        options = pycolmap.TwoViewGeometryOptions()
-        options.ransac.random_seed = 0
-        options.ransac.min_num_trials = MIN_TRIALS
-        options.detect_watermark = False
-        matches = mutual_matches(first, second)
-        if len(matches) < options.min_num_inliers:
-            return pycolmap.TwoViewGeometry()
-        return pycolmap.estimate_two_view_geometry(
-            camera1, first.pixels.astype(np.float64), camera2, second.pixels.astype(np.float64), matches, options
-        )
+class Side:
+    """One image of pairs: its features with what all its pairs need of them."""
+
+    def __init__(self, features: Features, camera: Camera) -> None:
+        self.features = features
+        self.rays = camera.rays(features.pixels)  # (N, 3), z = 1
+        self.focal_px = float(np.sqrt(camera.fx * camera.fy))
+        self.vectors = features.descriptors.astype(np.float32)  # (N, 128), whole numbers
+
+
+def verified_matches(first: Side, second: Side, band_px: float) -> Int:
+    """Return up to `MAX_MATCHES` matches (M, 2) that agree on an epipolar geometry, best spread first; or none."""
+    focal_px = 0.5 * (first.focal_px + second.focal_px)
+    some = _mutual(first.vectors[:FIRST_FEATURES], second.vectors[:FIRST_FEATURES])
+    geometry = relative_geometry(first.rays[some[:, 0]], second.rays[some[:, 1]], focal_px, band_px, MIN_INLIERS)
+    if geometry is None or np.count_nonzero(geometry.inliers) < WEAK_PAIR:
+        if len(some) >= MIN_HINTS and max(len(first.vectors), len(second.vectors)) > FIRST_FEATURES:
+            every = _mutual(first.vectors, second.vectors)
+            more = relative_geometry(first.rays[every[:, 0]], second.rays[every[:, 1]], focal_px, band_px, MIN_INLIERS)
+            if more is not None:
+                some, geometry = every, more
+        if geometry is None:
+            return np.zeros((0, 2), np.int64)
+    sure = some[geometry.inliers]
+    guided = guided_neighbours(
+        geometry.matrix, first.rays, second.rays, first.vectors, second.vectors, band_px / focal_px
+    )
+    found = _accepted(*guided)
+    found = found[_alike(first.features, second.features, sure, found)]
+    if len(found) < len(sure):
+        found = sure
+    # Features come best spread first: so do pairs of them, and the pairs of an image agree on which to keep.
+    return found[np.argsort(found.max(axis=1), kind="stable")[:MAX_MATCHES]]
 
 
 def mutual_matches(first: Features, second: Features) -> Int:
     """Return index pairs (M, 2) of mutual nearest RootSIFT neighbours that pass Lowe's ratio test."""
-    if not len(first.descriptors) or not len(second.descriptors):
-        return np.zeros((0, 2), np.uint32)
+    return _mutual(first.descriptors.astype(np.float32), second.descriptors.astype(np.float32))
+
+
+def _mutual(first: Float, second: Float) -> Int:
+    if not len(first) or not len(second):
+        return np.zeros((0, 2), np.int64)
     # One matrix product finds all distances: an order faster than building an index for a few thousand features.
-    similarity = first.descriptors.astype(np.float32) @ second.descriptors.astype(np.float32).T
+    similarity = first @ second.T
     best = similarity.argmax(axis=1)
-    nearest = similarity[np.arange(len(best)), best]
-    # The maximum of a column is an order cheaper than where it is; of equal features the first one counts.
+    rows = np.arange(len(best))
+    nearest = similarity[rows, best]
+    # The maximum of a column is an order cheaper than where it is.
     candidates = np.flatnonzero(nearest >= similarity.max(axis=0)[best])
-    rows = candidates[np.unique(best[candidates], return_index=True)[1]]
-    similarity[np.arange(len(best)), best] = -1.0
-    distance, second_distance = _distance(nearest[rows]), _distance(similarity.max(axis=1)[rows])
-    good = (distance < MAX_RATIO * second_distance) & (distance < MAX_DISTANCE)
-    return np.column_stack([rows[good], best[rows[good]]]).astype(np.uint32)
+    runner_up = np.full(len(best), np.inf, np.float32)
+    contested = similarity[candidates]
+    contested[np.arange(len(candidates)), best[candidates]] = -1.0
+    runner_up[candidates] = contested.max(axis=1)
+    return _accepted(rows, best, nearest, runner_up)
 
 
-def _distance(product: Float) -> Float:
-    return np.asarray(np.sqrt(np.maximum(2.0 - 2.0 * product / DESCRIPTOR_NORM**2, 0.0)))
+def _accepted(rows: Int, best: Int, nearest: Float, runner_up: Float) -> Int:
+    """Return the pairs that are near enough and clearly nearer than the runner-up; of equal ones the first counts."""
+    distance, second_distance = _squared_distance(nearest), _squared_distance(runner_up)
+    good = np.flatnonzero((distance < MAX_RATIO**2 * second_distance) & (distance < MAX_DISTANCE**2))
+    good = good[np.unique(best[good], return_index=True)[1]]
+    return np.column_stack([rows[good], best[good]])
 
 
-def to_pycolmap_camera(camera: Camera, camera_id: int) -> Any:
-    """Return the camera as pycolmap's OPENCV model, its focal length marked as known."""
-    pycolmap = load_pycolmap()
+def _squared_distance(product: Float) -> Float:
+    return np.asarray(np.maximum(2.0 - 2.0 * product / NORM**2, 0.0))
 
-    made = pycolmap.Camera(
-        model="OPENCV",
-        width=camera.width,
-        height=camera.height,
-        params=[camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion],
-        camera_id=camera_id,
-    )
-    made.has_prior_focal_length = True
-    return made
+
+def _alike(first: Features, second: Features, sure: Int, matches: Int) -> Bool:
+    """Return which matches change scale and turn as the sure ones do."""
+
+    def change(pairs: Int) -> tuple[Float, Float]:
+        scale = np.log(first.scales[pairs[:, 0]] / second.scales[pairs[:, 1]])
+        return scale, first.angles[pairs[:, 0]] - second.angles[pairs[:, 1]]
+
+    usual_scale, usual_turn = change(sure)
+    scale, turn = change(matches)
+    mean_turn = np.angle(np.exp(1j * usual_turn).sum())
+    off = np.abs((turn - mean_turn + np.pi) % (2.0 * np.pi) - np.pi)
+    return np.asarray((np.abs(scale - np.median(usual_scale)) < np.log(SCALE_FACTOR)) & (off < TURN_RAD))

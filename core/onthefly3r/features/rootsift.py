@@ -33,7 +33,7 @@ def describe(octaves: Sequence[Octave], keypoints: Keypoints) -> tuple[Float, UI
             rows = own[keypoints.level[own] == level]
             image = octave.levels[level]
             slopes = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=1), cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=1)
-            sigma = np.float32(SIGMA * STEP**level)
+            sigma = float(SIGMA * STEP**level)
             for start in range(0, len(rows), AT_ONCE):
                 part = rows[start : start + AT_ONCE]
                 angles[part] = _orientations(slopes, keypoints.xy[part], sigma)
@@ -41,29 +41,31 @@ def describe(octaves: Sequence[Octave], keypoints: Keypoints) -> tuple[Float, UI
     return angles, descriptors
 
 
-def _orientations(slopes: tuple[Float, Float], xy: Float, sigma: Float) -> Float:
+def _orientations(slopes: tuple[Float, Float], xy: Float, sigma: float) -> Float:
     """Return the directions (N,) in which the image brightens most about the keypoints."""
     offsets, weight = _orientation_window()
-    places = xy[:, None] + sigma * offsets
+    places = xy[:, None] + np.float32(sigma) * offsets
     strength, direction = _polar(slopes, places)
     count = len(xy)
     bins = np.rint(direction * np.float32(DIRECTIONS / (2.0 * np.pi))).astype(np.int64) % DIRECTIONS
     bins += DIRECTIONS * np.arange(count)[:, None]
     votes = np.bincount(bins.ravel(), (strength * weight).ravel(), DIRECTIONS * count).reshape(count, DIRECTIONS)
-    votes = sum(share * np.roll(votes, by, axis=1) for by, share in ((-2, 1), (-1, 4), (0, 6), (1, 4), (2, 1)))
-    rows, peak = np.arange(count), votes.argmax(axis=1)
-    before, here, after = votes[rows, peak - 1], votes[rows, peak], votes[rows, (peak + 1) % DIRECTIONS]
+    smooth = 6.0 * votes
+    for by, share in ((1, 4.0), (2, 1.0)):
+        smooth += share * (np.roll(votes, by, axis=1) + np.roll(votes, -by, axis=1))
+    rows, peak = np.arange(count), smooth.argmax(axis=1)
+    before, here, after = smooth[rows, peak - 1], smooth[rows, peak], smooth[rows, (peak + 1) % DIRECTIONS]
     curvature = np.minimum(before - 2.0 * here + after, -1e-12)
-    return ((peak + 0.5 * (before - after) / curvature) * (2.0 * np.pi / DIRECTIONS)).astype(np.float32)
+    return np.asarray((peak + 0.5 * (before - after) / curvature) * (2.0 * np.pi / DIRECTIONS), np.float32)
 
 
-def _descriptors(slopes: tuple[Float, Float], xy: Float, sigma: Float, angles: Float) -> UInt8:
+def _descriptors(slopes: tuple[Float, Float], xy: Float, sigma: float, angles: Float) -> UInt8:
     offsets, pooling = _descriptor_window()
     cosine, sine = np.cos(angles)[:, None], np.sin(angles)[:, None]
     turned = np.stack(
         [cosine * offsets[:, 0] - sine * offsets[:, 1], sine * offsets[:, 0] + cosine * offsets[:, 1]], axis=-1
     )
-    strength, direction = _polar(slopes, xy[:, None] + np.float32(CELL_SIGMAS) * sigma * turned)
+    strength, direction = _polar(slopes, xy[:, None] + np.float32(CELL_SIGMAS * sigma) * turned)
     place = (direction - angles[:, None]) * np.float32(BINS / (2.0 * np.pi)) + np.float32(2 * BINS)
     lower = place.astype(np.int32)
     share = (place - lower) * strength
@@ -76,7 +78,7 @@ def _descriptors(slopes: tuple[Float, Float], xy: Float, sigma: Float, angles: F
     vectors /= np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.float32(1e-9))
     np.minimum(vectors, np.float32(CLIPPED), out=vectors)
     vectors /= np.maximum(vectors.sum(axis=1, keepdims=True), np.float32(1e-9))
-    return np.rint(np.sqrt(vectors) * np.float32(NORM)).clip(0, 255).astype(np.uint8)
+    return np.asarray(np.rint(np.sqrt(vectors) * np.float32(NORM)).clip(0, 255), np.uint8)
 
 
 def _polar(slopes: tuple[Float, Float], places: Float) -> tuple[Float, Float]:

@@ -51,7 +51,7 @@ class VladDescriber:
         self._words = np.asarray(words, np.float32)
 
     def describe(self, index: int, image: WorkingImage) -> Float:
-        """Return the L2-normalised descriptor (8192,) float32; zeros for an image without features, or whose features are words."""
+        """Return the L2-normalised descriptor (8192,) float32; zeros for an image in which it sees nothing."""
         if self._words is None:
             raise RuntimeError("describe() before fit()")
         vectors = _unit(self.features.features_of(index, image).descriptors)
