@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import synthetic_block as synthetic
-from onthefly3r.adjust.refine import Tracks, chosen_tracks, joined_tracks, refine
+from onthefly3r.adjust.refine import refine
+from onthefly3r.adjust.tracks import Tracks, chosen_tracks, joined_tracks
 from onthefly3r.geometry.camera import PixelMap
 from onthefly3r.geometry.transforms import Rigid3, Sim3, rotation_angle_deg, rotation_exp
 from onthefly3r.geometry.umeyama import weighted_similarity

@@ -233,6 +233,30 @@ class GeoreferenceOptions(CheckedOptions):
         "name, x, y, z and, if known, yaw, pitch, roll in degrees (pitch 0 looks down)",
         example="geo.txt",
     )
+    gps: Literal["adjust", "fit"] = option(
+        "adjust",
+        "adjust lets camera positions take part in the adjustment of the cameras; fit only fits the finished map to "
+        "them, as the paper does",
+        choices=("adjust", "fit"),
+        advanced=True,
+    )
+    control: str | None = option(
+        None,
+        "file of ground control: gcp_list.txt, a CSV with a header (label, x, y, z, image, px, py) or GeoJSON points; "
+        "labels that begin with CHK- are checkpoints",
+        example="gcp_list.txt",
+    )
+    control_marks: str | None = option(
+        None,
+        "second CSV with the marks (image, label, px, py) where the control file has the points only",
+        example="marks.csv",
+        advanced=True,
+    )
+    checkpoints: str | None = option(
+        None,
+        "labels of control points that take no part in the adjustment and check it, separated by commas",
+        example="P3,P7",
+    )
     local: bool = option(
         False,
         "write local coordinates without a CRS; the unit is the metre if positions or the local reconstructor give the "

@@ -323,6 +323,47 @@ class PlacedMap(Protocol):
 
 
 @dataclass(frozen=True)
+class CameraDeviation:
+    """Standard deviations of an adjusted camera in the frame of the Earth."""
+
+    h_m: float  # per horizontal axis
+    v_m: float
+    angle_deg: float  # per axis
+
+
+@dataclass(frozen=True)
+class ControlResidual:
+    """A control point or checkpoint: where its marks meet in the adjusted cameras minus its coordinates."""
+
+    label: str
+    role: Literal["control", "checkpoint", "left out"]
+    images: int  # with a mark that counts
+    east_m: float
+    north_m: float
+    up_m: float  # NaN where the point has no height
+    sigma_h_m: float  # of the place found, per horizontal axis
+    sigma_v_m: float
+    marks_px: float  # root mean square misfit of its marks
+    enu_m: tuple[float, float, float]  # its coordinates in local east-north-up
+
+
+@dataclass(frozen=True)
+class EarthTie:
+    """How an adjusted map lies on the Earth, and how well it is known."""
+
+    enu_from_map: Sim3
+    origin_lat_deg: float
+    origin_lon_deg: float
+    origin_height_m: float
+    by_control: bool  # control took part; else positions alone, which may be fitted anew
+    crs: str | None  # that of the control
+    vertical: VerticalReference
+    deviations: Mapping[int, CameraDeviation] = field(default_factory=dict)  # by shot index
+    control: tuple[ControlResidual, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class GeoReference:
     """The map tied to the Earth: local ENU about an origin, and the CRS of the export."""
 
@@ -339,6 +380,8 @@ class GeoReference:
     rmse_v_m: float
     residuals_m: Mapping[int, tuple[float, float, float]] = field(default_factory=dict)  # shot -> east, north, up
     warnings: tuple[str, ...] = ()
+    deviations: Mapping[int, CameraDeviation] = field(default_factory=dict)  # by shot index
+    control: tuple[ControlResidual, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -54,6 +54,7 @@ class Bundle:
     whitening: Float  # (K, 8, 8)
     adjustable: Bool  # (8,) or (K, 8) which of PARAMETERS may change
     ties: Ties | None = None
+    spread: Float | float = 1.0  # (M,) standard deviation relative to that of a tie point
     prior_weight: Float | float = 1.0  # (K, 8) of the deviations from the priors
 
     def camera(self, key: str, state: State) -> Camera:
@@ -73,7 +74,7 @@ class Bundle:
 
     def noise_px(self, state: State) -> float:
         """Return the standard deviation of a pixel coordinate, from the median residual and the redundancy."""
-        squared = np.sum(self.residuals(state) ** 2, axis=1)
+        squared = np.sum(self.residuals(state) ** 2, axis=1) / np.square(self.spread)
         squared = squared[np.isfinite(squared)]
         unknowns = 3 * len(state.points) + 6 * len(self.keys)
         redundancy = max(1.0 - unknowns / (2.0 * len(squared)), 0.05)
@@ -81,7 +82,7 @@ class Bundle:
 
     def cost(self, state: State, noise_px: float) -> float:
         """Return half the weighted Huber cost, priors and ties added; infinite with a point behind its camera."""
-        ratio = np.linalg.norm(self.residuals(state), axis=1) / noise_px
+        ratio = np.linalg.norm(self.residuals(state), axis=1) / (noise_px * self.spread)
         if not np.isfinite(ratio).all():
             return np.inf
         huber = np.where(ratio <= HUBER, 0.5 * ratio**2, HUBER * (ratio - 0.5 * HUBER))
@@ -96,8 +97,8 @@ class Bundle:
     def normal_equations(self, state: State, noise_px: float) -> NormalEquations:
         """Return the normal equations of the reweighted residuals, priors and ties."""
         residual = self.residuals(state)
-        ratio = np.linalg.norm(residual, axis=1) / noise_px
-        root = np.sqrt(self.weight * np.minimum(1.0, HUBER / np.maximum(ratio, 1e-12))) / noise_px
+        ratio = np.linalg.norm(residual, axis=1) / (noise_px * self.spread)
+        root = np.sqrt(self.weight * np.minimum(1.0, HUBER / np.maximum(ratio, 1e-12))) / (noise_px * self.spread)
         residual = root[:, None] * residual
         by_pose, by_intrinsics, by_point = (root[:, None, None] * jacobian for jacobian in self.jacobians(state))
         cc, c = self._poses_and_shared(state, by_pose, by_intrinsics, residual)

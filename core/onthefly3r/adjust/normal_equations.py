@@ -72,17 +72,30 @@ class NormalEquations:
         """Return the function that multiplies right sides (D,) or (D, k) of C by the covariance of C."""
         return self._solver(self.eliminated(0.0)[2])
 
-    def _solver(self, matrix: Any) -> Any:
-        """Return a solver of the system of C, scaled to a unit diagonal of `cc`: rotations and metres are alike."""
-        from scipy import sparse
-        from scipy.sparse.linalg import splu
+    def samples(self, count: int, seed: int) -> Float:
+        """Return draws (D, count) from the normal distribution whose covariance is that of C."""
+        factor, scale = self._factor(self.eliminated(0.0)[2])
+        # P S P' = L D L' with U = D L': P' L sqrt(D) z has the covariance S, and S^-1 times that has S^-1.
+        z = np.random.default_rng(seed).standard_normal((len(self.c), count))
+        root = factor.L @ (np.sqrt(np.maximum(factor.U.diagonal(), 0.0))[:, None] * z)
+        return np.asarray(scale[:, None] * factor.solve(root[factor.perm_r]))
 
-        scale = 1.0 / np.sqrt(self.cc.diagonal())
-        scaled = (sparse.diags(scale) @ matrix @ sparse.diags(scale)).tocsc()
-        factor = splu(scaled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    def _solver(self, matrix: Any) -> Any:
+        """Return the function that solves the system of C for right sides (D,) or (D, k)."""
+        factor, scale = self._factor(matrix)
 
         def solved(right: Float) -> Float:
             columns = scale.reshape(-1, *[1] * (right.ndim - 1))
             return np.asarray(columns * factor.solve(columns * right))
 
         return solved
+
+    def _factor(self, matrix: Any) -> tuple[Any, Float]:
+        """Return the factors of the system of C, scaled to a unit diagonal of `cc`: rotations and metres are alike."""
+        from scipy import sparse
+        from scipy.sparse.linalg import splu
+
+        scale = 1.0 / np.sqrt(self.cc.diagonal())
+        scaled = (sparse.diags(scale) @ matrix @ sparse.diags(scale)).tocsc()
+        options = {"SymmetricMode": True}
+        return splu(scaled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options), scale

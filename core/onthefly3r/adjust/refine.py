@@ -12,32 +12,19 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.arrays import Bool, Float, Int
+from ..geometry.arrays import Bool
 from ..geometry.camera import Camera
 from ..geometry.transforms import Rigid3, Sim3
 from ..records import Observations, PlacedMap, Shot
 from .bundle import Bundle, State
-from .evidence import PrincipalPoint, calibrate
+from .evidence import Calibrated, PrincipalPoint, calibrate
 from .intrinsics import PARAMETERS, intrinsics_of
 from .selfcal import IntrinsicsPrior
+from .tracks import Tracks, chosen_tracks, images_of, joined_tracks, only
 
-OBSERVATIONS = 40_000  # to aim at in all: a small map uses all that it has,
-CELLS = 6  # an image at least
-LEAST_PER_CELL = 3  # of its longest tracks in each of 6 x 6 cells
 MIN_IMAGES = 3
-MIN_OBSERVATIONS = 20  # an image with fewer follows the nearest refined one of its submap
+NO_WORSE = 1.02  # times the median error before: a map that has settled already may come out a hair above it
 ABSURD = 0.1  # of the image's longest side: an observation that starts farther off is a mismatch
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """Points of the map and the images that see them; one observation of a point in an image."""
-
-    image: Int  # (M,) shot index
-    pixel: Float  # (M, 2) photograph
-    depth: Float  # (M,) along the camera's axis as its own submap predicted it, submap units; NaN elsewhere
-    point: Int  # (M,) row of the point, ascending
-    points: Float  # (N, 3) map frame
 
 
 @dataclass(frozen=True)
@@ -47,6 +34,16 @@ class Refinement:
     map_from_submap: Mapping[int, Sim3]  # by shot index
     calibrations: Mapping[str, Camera]  # by camera key, photograph size
     notes: Mapping[str, Any]  # JSON values for the report
+
+
+@dataclass(frozen=True)
+class Block:
+    """A map as a bundle: the chosen tracks, the images that share enough of them, and where all starts."""
+
+    tracks: Tracks
+    images: tuple[int, ...]  # shot index of every row of the bundle
+    bundle: Bundle
+    start: State
 
 
 def refine(
@@ -63,133 +60,63 @@ def refine(
         shots: at least those of the map.
         principal_point: whether that of the cameras is free, held in the middle, or as the evidence says.
     """
+    block = block_of(state, observed, shots)
+    solved = None if block is None else calibrated(block, principal_point)
+    return None if block is None or solved is None else refinement(block, solved, state)
+
+
+def block_of(state: PlacedMap, observed: Iterable[tuple[int, Observations]], shots: Mapping[int, Shot]) -> Block | None:
+    """Return the map as a bundle, None where fewer than three images share enough tracks."""
     tracks = chosen_tracks(joined_tracks(state, observed), state.frames)
-    if len(_images(tracks)) < MIN_IMAGES:
+    if len(images_of(tracks)) < MIN_IMAGES:
         return None
-    tracks = _only(tracks, _plausible(tracks, state, shots))
-    images = _images(tracks)
+    tracks = only(tracks, _plausible(tracks, state, shots))
+    images = images_of(tracks)
     if len(images) < MIN_IMAGES:
         return None
     bundle = _bundle(tracks, images, state, shots)
-    start = _start(tracks, images, state, bundle.free)
+    return Block(tracks, images, bundle, _start(tracks, images, state, bundle.free))
+
+
+def calibrated(block: Block, principal_point: PrincipalPoint) -> Calibrated | None:
+    """Return the block adjusted to its tracks alone, None when it does not settle or tracks agree no better."""
     try:
-        solved = calibrate(bundle, start, principal_point)
+        solved = calibrate(block.bundle, block.start, principal_point)
     except (np.linalg.LinAlgError, RuntimeError):  # singular: numpy's word for it and SuperLU's
         return None
-    adjusted = solved.state
-    before, after = (np.linalg.norm(bundle.residuals(s), axis=1) for s in (start, adjusted))
-    if not np.median(after) <= np.median(before):
-        return None
-    moved = _moved_frames(tracks, images, state, adjusted)
+    before, after = (median_error_px(block.bundle, s) for s in (block.start, solved.state))
+    return solved if after <= NO_WORSE * before else None
+
+
+def median_error_px(bundle: Bundle, state: State) -> float:
+    """Return the median reprojection error in pixels."""
+    return float(np.median(np.linalg.norm(bundle.residuals(state), axis=1)))
+
+
+def refinement(block: Block, solved: Calibrated, state: PlacedMap) -> Refinement:
+    """Return what an adjusted block, in the frame of the map, means for the frames of the map."""
+    moved = _moved_frames(block.tracks, block.images, state, solved.state)
     return Refinement(
         map_from_submap=_with_followers(moved, state),
-        calibrations={key: bundle.camera(key, adjusted) for key in bundle.free},
+        calibrations={key: solved.bundle.camera(key, solved.state) for key in solved.bundle.free},
         notes={
             "refined_images": float(len(moved)),
-            "refined_points": float(len(tracks.points)),
-            "reprojection_before_px": float(np.median(before)),
-            "reprojection_after_px": float(np.median(after)),
+            "refined_points": float(len(block.tracks.points)),
+            "reprojection_before_px": median_error_px(block.bundle, block.start),
+            "reprojection_after_px": median_error_px(block.bundle, solved.state),
             "principal_point": dict(solved.verdict),
         },
     )
 
 
-def joined_tracks(state: PlacedMap, observed: Iterable[tuple[int, Observations]]) -> Tracks:
-    """Join observations of the same feature across submaps; tracks that see one image twice are mistaken and left out.
-
-    A point starts at the mean of what the submaps predict for it.
-    """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    image, feature, pixel, depth, local_point, points = _collected(state, observed)
-    if len(image) == 0:
-        return Tracks(image, pixel, depth, local_point, points)
-    key = image.astype(np.int64) << 32 | feature
-    _, first, node = np.unique(key, return_index=True, return_inverse=True)
-    n_nodes, n_local = len(first), len(points)
-    graph = coo_matrix((np.ones(len(key), bool), (node, n_nodes + local_point)), shape=(n_nodes + n_local,) * 2)
-    n_tracks, track = connected_components(graph, directed=False)
-
-    total = np.stack([np.bincount(track[n_nodes:], points[:, k], n_tracks) for k in range(3)], axis=1)
-    mean = total / np.maximum(np.bincount(track[n_nodes:], minlength=n_tracks), 1)[:, None]
-    own_depth = np.full(n_nodes, np.nan)
-    known = np.isfinite(depth)
-    own_depth[node[known]] = depth[known]
-
-    node_track, node_image = track[:n_nodes], image[first]
-    distinct = np.unique(np.stack([node_track, node_image]), axis=1)
-    images_of = np.bincount(distinct[0], minlength=n_tracks)
-    sound = (np.bincount(node_track, minlength=n_tracks) == images_of) & (images_of >= 2)
-    rows = np.flatnonzero(sound[node_track])
-    rows = rows[np.argsort(node_track[rows], kind="stable")]
-    kept, point = np.unique(node_track[rows], return_inverse=True)
-    return Tracks(node_image[rows], pixel[first][rows], own_depth[rows], point, mean[kept])
-
-
-def chosen_tracks(tracks: Tracks, frames: Mapping[int, object]) -> Tracks:
-    """Return the tracks that are among the longest of a cell of some image, without images that have next to none."""
-    count = np.bincount(tracks.point, minlength=len(tracks.points))
-    width, height = (tracks.pixel.max(axis=0) + 1.0) if len(tracks.pixel) else (1.0, 1.0)
-    cell = (tracks.pixel / (width, height) * CELLS).astype(int) @ (1, CELLS)
-    group = tracks.image * CELLS**2 + cell
-    order = np.lexsort((-count[tracks.point], group))
-    in_order = group[order]
-    rank = np.arange(len(order)) - np.searchsorted(in_order, in_order)
-    best = np.zeros(len(tracks.points), bool)
-    per_cell = max(LEAST_PER_CELL, OBSERVATIONS // (max(len(frames), 1) * CELLS**2))
-    best[tracks.point[order[rank < per_cell]]] = True
-    tracks = _only(tracks, best[tracks.point])
-    enough = np.bincount(tracks.image, minlength=1) >= MIN_OBSERVATIONS
-    return _only(tracks, enough[tracks.image])
-
-
 def _plausible(tracks: Tracks, state: PlacedMap, shots: Mapping[int, Shot]) -> Bool:
     """Return which observations (M,) lie in front of their cameras and not absurdly far from where they should be."""
-    images = _images(tracks)
+    images = images_of(tracks)
     bundle = _bundle(tracks, images, state, shots)
     residual = np.linalg.norm(bundle.residuals(_start(tracks, images, state, bundle.free)), axis=1)
     longest = np.array([max(shots[i].width_px, shots[i].height_px) for i in images])
     # False where the residual is NaN, behind the camera.
     return np.asarray(residual <= ABSURD * longest[np.searchsorted(np.array(images), tracks.image)])
-
-
-def _images(tracks: Tracks) -> tuple[int, ...]:
-    return tuple(int(i) for i in np.unique(tracks.image))
-
-
-def _only(tracks: Tracks, keep: Bool) -> Tracks:
-    """Return the observations to keep, without points that fewer than two images see."""
-    count = np.bincount(tracks.point[keep], minlength=len(tracks.points))
-    keep = keep & (count[tracks.point] >= 2)
-    kept, point = np.unique(tracks.point[keep], return_inverse=True)
-    return Tracks(tracks.image[keep], tracks.pixel[keep], tracks.depth[keep], point, tracks.points[kept])
-
-
-def _collected(
-    state: PlacedMap, observed: Iterable[tuple[int, Observations]]
-) -> tuple[Int, Int, Float, Float, Int, Float]:
-    parts: list[tuple[Int, Int, Float, Float, Int]] = []
-    points: list[Float] = [np.zeros((0, 3))]
-    offset = 0
-    for submap, found in observed:
-        placed = np.isin(found.image, list(state.frames))
-        image = found.image[placed]
-        depth = np.full(len(image), np.nan)
-        for index in np.unique(image):
-            frame = state.frames[int(index)]
-            if frame.submap == submap:
-                rows = np.flatnonzero(image == index)
-                seen = found.points[found.point[placed][rows]].astype(float)
-                depth[rows] = (seen - frame.submap_from_cam.translation) @ frame.submap_from_cam.rotation[:, 2]
-        parts.append(
-            (image, found.feature[placed], found.pixel[placed].astype(float), depth, found.point[placed] + offset)
-        )
-        points.append(state.map_from_submap[submap].apply(found.points.astype(float)))
-        offset += len(found.points)
-    empty = np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int)
-    image, feature, pixel, depth, point = (np.concatenate(column) for column in zip(empty, *parts, strict=True))
-    return image, feature, pixel, depth, point, np.concatenate(points)
 
 
 def _bundle(tracks: Tracks, images: tuple[int, ...], state: PlacedMap, shots: Mapping[int, Shot]) -> Bundle:

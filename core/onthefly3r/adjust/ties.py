@@ -16,6 +16,7 @@ from ..geometry.transforms import skew
 HUBER_POSITION = 2.0  # standard deviations
 HUBER_CONTROL = 3.0
 LEVER = 3  # the last biases: the antenna from the camera, in the camera's axes
+AXES = np.arange(3)
 
 
 @dataclass(frozen=True)
@@ -31,15 +32,15 @@ class CameraTerms:
 
 @dataclass(frozen=True)
 class Ties:
-    """Positions of cameras with a height bias per flight and a lever arm, the level, and control points.
+    """Positions of cameras with a bias per flight and a lever arm, the level, and control points.
 
-    The biases are one height per flight, then the lever arm. One whose prior has the sigma 0 is held at zero.
+    The biases are east, north and up of each flight, then the lever arm. One whose sigma is 0 is held at zero.
     """
 
     position: Float  # (I, 3) m; any value where sigma is infinite
     sigma: Float  # (I, 3) m, infinite where nothing is known
     flight: Int  # (I,) number of the flight
-    bias_sigma: Float  # (B,) flights, then 3 for the lever arm; 0 holds
+    bias_sigma: Float  # (B,) m, three per flight, then 3 for the lever arm; 0 holds
     up: Float  # (I, 3) the upward direction in each camera's axes as far as known, unit length
     level_root: Float  # (I, 2, 2) root of the information of its east and north components; 0 where unknown
     control: Int  # (K,) rows of the points that are ground control
@@ -59,8 +60,7 @@ class Ties:
 
     def residuals(self, rotations: Float, centres: Float, biases: Float) -> Float:
         """Return position minus camera (I, 3) once biases are taken off, in standard deviations; 0 where none is."""
-        off = self.position - centres - rotations @ biases[-LEVER:]
-        off[:, 2] -= biases[self.flight]
+        off = self.position - centres - rotations @ biases[-LEVER:] - biases[:-LEVER].reshape(-1, 3)[self.flight]
         return np.asarray(np.where(np.isfinite(self.sigma), off, 0.0) / self.sigma)
 
     def cameras(self, rotations: Float, centres: Float, biases: Float) -> CameraTerms:
@@ -71,7 +71,7 @@ class Ties:
         jacobian = np.zeros((n, 3, 6 + n_biases))  # of the modelled position
         jacobian[:, :, 3:6] = np.eye(3)
         jacobian[:, :, :3] = -rotations @ skew(biases[-LEVER:])
-        jacobian[np.arange(n), 2, 6 + self.flight] = 1.0
+        jacobian[np.arange(n)[:, None], AXES, 6 + 3 * self.flight[:, None] + AXES] = 1.0
         jacobian[:, :, -LEVER:] = rotations
         root = np.repeat(root, (2, 1), axis=1)
         jacobian *= (root / self.sigma)[:, :, None]

@@ -60,9 +60,9 @@ def georeference(
     images = sorted(map_from_cam)
     positions = usable_positions(images, shots, options)
     _require_enough(positions, len(images))
-    crs = _target_crs(options, positions)
+    crs = target_crs(options, positions)
     centres = np.array([map_from_cam[i].translation for i in positions.images])
-    solution, witnesses, doubts = _levelled(map_from_cam, shots, centres, positions, ground_normal, seed)
+    solution, witnesses, doubts = levelled(map_from_cam, shots, centres, positions, ground_normal, seed)
     _require_trustworthy(solution, centres, witnesses, doubts)
     used = solution.inlier_h
     heights = solution.inlier_h & solution.inlier_v
@@ -101,7 +101,7 @@ def _require_enough(positions: Positions, placed: int) -> None:
         )
 
 
-def _levelled(
+def levelled(
     map_from_cam: Mapping[int, Rigid3],
     shots: Mapping[int, Shot],
     centres: Float,
@@ -178,10 +178,11 @@ def metres_per_map_unit(
 def check_crs(shots: Mapping[int, Shot], options: GeoreferenceOptions) -> None:
     """Raise `OptionError` now if the CRS that is asked for cannot be used where the photographs were taken."""
     if options.crs is not None and not options.local:
-        _target_crs(options, usable_positions(sorted(shots), shots, options))
+        target_crs(options, usable_positions(sorted(shots), shots, options))
 
 
-def _target_crs(options: GeoreferenceOptions, positions: Positions) -> str:
+def target_crs(options: GeoreferenceOptions, positions: Positions) -> str:
+    """Return the projected CRS of the result; raises `OptionError` where the one asked for cannot be used."""
     from pyproj.exceptions import ProjError
 
     frame = positions.frame

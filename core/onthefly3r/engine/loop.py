@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ..adjust.refine import refine
 from ..backbones.base import Backbone, ExtractsFeatures, Interruptible
+from ..earth.blockadjust import adjust_block
 from ..errors import Cancelled, PhotographError
 from ..geometry.arrays import Float
 from ..geometry.transforms import Sim3
@@ -441,15 +441,13 @@ class Engine:
     def _refine(self) -> None:
         with self.stopwatch.stage("refinement"):
             self._checkpoint("refining the cameras", 0, 1)
-            refined = refine(
-                self.state,
-                self.store.stream_observations(),
-                self.shots,
-                self.options.backbone.principal_point,
-            )
-            if refined is not None:
-                self.state.move_refined(refined.map_from_submap, refined.calibrations)
-                self.refinement = refined.notes
+            adjusted = adjust_block(self.state, self.store.stream_observations(), self.shots, self.options)
+            if adjusted is not None:
+                self.state.move_refined(adjusted.refinement.map_from_submap, adjusted.refinement.calibrations)
+                self.refinement = adjusted.refinement.notes
+                self.warnings += adjusted.warnings
+                if adjusted.tie is not None:
+                    self.state.set_tie(adjusted.tie)
 
     def _stop_if_cancelled(self) -> None:
         if self._cancel is not None and self._cancel():

@@ -10,7 +10,18 @@ import numpy as np
 
 from ..geometry.camera import Camera, PixelMap
 from ..geometry.transforms import Rigid3, Sim3
-from ..records import Attitude, Frame, FrameEdge, GpsFix, Shot, Sighting, Submap
+from ..records import (
+    Attitude,
+    CameraDeviation,
+    ControlResidual,
+    EarthTie,
+    Frame,
+    FrameEdge,
+    GpsFix,
+    Shot,
+    Sighting,
+    Submap,
+)
 
 
 def sim3_to_json(transform: Sim3) -> dict[str, Any]:
@@ -42,6 +53,24 @@ def camera_from_json(value: Any) -> Camera:
     k1, k2, p1, p2 = (float(v) for v in value["distortion"])
     fx, fy, cx, cy = (float(value[name]) for name in ("fx", "fy", "cx", "cy"))
     return Camera(int(value["width"]), int(value["height"]), fx, fy, cx, cy, (k1, k2, p1, p2))
+
+
+def tie_to_json(tie: EarthTie) -> dict[str, Any]:
+    """Return everything of a tie to the Earth."""
+    return {**asdict(tie), "enu_from_map": sim3_to_json(tie.enu_from_map)}
+
+
+def tie_from_json(value: Any) -> EarthTie:
+    """Inverse of `tie_to_json`."""
+    return EarthTie(
+        **{
+            **value,
+            "enu_from_map": sim3_from_json(value["enu_from_map"]),
+            "deviations": {int(i): CameraDeviation(**one) for i, one in value["deviations"].items()},
+            "control": tuple(ControlResidual(**{**one, "enu_m": tuple(one["enu_m"])}) for one in value["control"]),
+            "warnings": tuple(value["warnings"]),
+        }
+    )
 
 
 def submap_to_json(submap: Submap) -> dict[str, Any]:

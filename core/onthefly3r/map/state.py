@@ -12,8 +12,17 @@ from ..errors import InputError
 from ..geometry.arrays import Float
 from ..geometry.camera import Camera
 from ..geometry.transforms import Rigid3, Sim3
-from ..records import CompactReference, Frame, FrameEdge, NewFrame, Observations, Sighting, Submap
-from .journal import camera_from_json, rigid3_from_json, rigid3_to_json, sim3_from_json, sim3_to_json, submap_from_json
+from ..records import CompactReference, EarthTie, Frame, FrameEdge, NewFrame, Observations, Sighting, Submap
+from .journal import (
+    camera_from_json,
+    rigid3_from_json,
+    rigid3_to_json,
+    sim3_from_json,
+    sim3_to_json,
+    submap_from_json,
+    tie_from_json,
+    tie_to_json,
+)
 from .store import Store
 
 
@@ -39,6 +48,7 @@ class MapState:
         self.curvatures_of: dict[int, Float] = {}  # (3,) as last found, per unit of the submap (`bending.py`)
         self._moved: dict[int, Rigid3] = {}
         self._settled: dict[int, Sim3] = {}
+        self.tie: EarthTie | None = None  # how the adjusted map lies on the Earth
 
     @classmethod
     def load(cls, store: Store) -> MapState:
@@ -61,6 +71,8 @@ class MapState:
                 elif kind == "refined":
                     state._settled.update({int(k): sim3_from_json(v) for k, v in value["frames"].items()})
                     state.calibrations.update({k: camera_from_json(v) for k, v in value["calibrations"].items()})
+                elif kind == "tie":
+                    state.tie = tie_from_json(value)
                 elif kind == "frame_poses":
                     state._moved.update({int(k): rigid3_from_json(v) for k, v in value.items()})
             except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -184,6 +196,11 @@ class MapState:
         self.calibrations.update(calibrations)
         frames = {str(k): sim3_to_json(v) for k, v in map_from_submap.items()}
         self._store.note("refined", {"frames": frames, "calibrations": {k: asdict(c) for k, c in calibrations.items()}})
+
+    def set_tie(self, tie: EarthTie) -> None:
+        """Take over how the adjusted map lies on the Earth; what moves frames later makes it untrue."""
+        self.tie = tie
+        self._store.note("tie", tie_to_json(tie))
 
     def move_frames(self, map_from_cam: Mapping[int, Rigid3]) -> None:
         """Take over optimised camera poses only, as the paper's SE(3) graph does; the cloud stays."""

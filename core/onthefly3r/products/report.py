@@ -13,6 +13,7 @@ from .. import __version__
 from ..files.atomic import write_text
 from ..options import Options
 from ..records import GeoReference
+from .accuracy import accuracy_report
 from .las import CloudSummary
 
 
@@ -97,6 +98,7 @@ def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
             "rmse_v_m": geo.rmse_v_m,
             "method": geo.method,
         },
+        "accuracy": None if geo is None else accuracy_report(geo),
         "cloud": None
         if cloud is None
         else {

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from ..earth.control_file import control_of
 from ..earth.georef import check_crs
 from ..earth.georef import georeference as tie_to_earth
 from ..earth.ground import ground_normal
@@ -85,5 +86,6 @@ def open_run(run: Path, options: Options) -> Mapped:
 def require_fitting(shots: Sequence[Shot], options: Options) -> None:
     """Raise `InputError` when the CRS or the boundary is none for these photographs: told before the work."""
     check_crs(dict(enumerate(shots)), options.georeference)
+    control_of(options.georeference)  # a file that is wrong is told before the work, not after it
     if options.export.boundary is not None:
         require_boundary_near(Path(options.export.boundary), list(shots))

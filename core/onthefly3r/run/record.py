@@ -20,6 +20,7 @@ FORMAT = 2  # 1, of release 0.1, told neither format nor stage, and was written 
 MAX_BYTES = 256 * 2**20
 
 Stage = Literal["reconstructing", "mapped"]  # mapped: every photograph was placed or refused, and the map is final
+NOT_AGAIN = {"positions", "boundary", "cloud", "control", "control_marks", "checkpoints"}  # files that may be gone
 
 
 @dataclass
@@ -103,7 +104,7 @@ def earlier_options(run: Path) -> dict[str, Any]:
         raise InputError(f"{path} is no record of a run (it names no options); name the output folder of a run")
     slices = slice_classes()
     names = {item.name for name in ("georeference", "export") for item in fields(slices[name])}
-    return {name: options[name] for name in names - {"positions", "boundary", "cloud"} if name in options}
+    return {name: options[name] for name in names - NOT_AGAIN if name in options}
 
 
 def _load(path: Path) -> dict[str, Any]:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..earth.georef import georeference, metres_per_map_unit
+from ..earth.control_reference import earth_reference
+from ..earth.georef import metres_per_map_unit
 from ..earth.ground import ground_normal
 from ..errors import Cancelled, ReconstructionError
 from ..files.las_index import indexes_beside, indexes_of
@@ -143,7 +144,7 @@ def _export(
             if metres_per_unit is None:
                 warnings.append("no positions tell the scale: the units of the local frame are not metres")
         else:
-            reference = georeference(poses, record.shots, options.georeference, up)
+            reference = earth_reference(state.tie, poses, record.shots, options.georeference, up)
     with stopwatch.stage("export"):
         view = RunView(
             title=folder.path.resolve().name,
