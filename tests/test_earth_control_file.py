@@ -59,7 +59,8 @@ def test_utm_with_tabs_and_blanks_in_names(tmp_path: Path) -> None:
     "text",
     [
         "label,x,y,z,image,px,py\nP1,500010.5,5400020.25,312.5,a.jpg,10,20\nP1,500010.5,5400020.25,312.5,b.jpg,11,21\n",
-        "# EPSG:32633\n#Label;X/Easting;Y/Northing;Z/Altitude;Image;X px;Y px\nP1;500010,5;5400020,25;312,5;a.jpg;10;20\n"
+        "# EPSG:32633\n#Label;X/Easting;Y/Northing;Z/Altitude;Image;X px;Y px\n"
+        "P1;500010,5;5400020,25;312,5;a.jpg;10;20\n"
         "P1;;;;b.jpg;11;21\n",
         "Name\tEasting\tNorthing\tHeight\tPhoto\tPixel X\tPixel Y\nP1\t500010.5\t5400020.25\t312.5\ta.jpg\t10\t20\n"
         "P1\t500010.5\t5400020.25\t312.5\tb.jpg\t11\t21\n",

@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..earth.control_file import control_of
+from ..earth.control_reference import earth_reference
 from ..earth.georef import check_crs
-from ..earth.georef import georeference as tie_to_earth
 from ..earth.ground import ground_normal
 from ..errors import InputError
 from ..intake.positions_file import read_positions, with_positions
@@ -58,7 +58,7 @@ def georeference(run: Path, options: Options | None = None) -> GeoReference:
     mapped = open_run(Path(run), options)
     state = mapped.state
     poses = {index: state.map_from_cam(index) for index in state.frames}
-    return tie_to_earth(poses, mapped.record.shots, options.georeference, ground_normal(state))
+    return earth_reference(state.tie, poses, mapped.record.shots, options.georeference, ground_normal(state))
 
 
 def open_run(run: Path, options: Options) -> Mapped:
