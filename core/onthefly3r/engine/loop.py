@@ -87,7 +87,7 @@ class Engine:
         self.warnings: list[str] = []
         self._backbone = backbone
         self._describer = describer
-        self._images = ImageCache(self.shots, load)
+        self._images = ImageCache(self.shots, load, work / "features")  # beside what else can be made again
         self._progress = progress
         self._cancel = cancel
         self._index = RetrievalIndex()

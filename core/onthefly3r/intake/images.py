@@ -132,7 +132,17 @@ def _reduce(image: Image | RawImage, shot: Shot, working_px: int) -> Image:
         rgb = _to_rgb(image)  # type: ignore[arg-type]
     if rgb.size == size and (box is None or size == (full_width, full_height)):
         return rgb
+    if box in (None, (0, 0, *rgb.size)) and rgb.width >= size[0] and rgb.height >= size[1]:
+        return _mean_over_areas(rgb, size)
     return rgb.resize(size, Resampling.LANCZOS, box=box)
+
+
+def _mean_over_areas(rgb: Image, size: tuple[int, int]) -> Image:
+    """Reduce a picture; each pixel becomes the mean of the area it covers, in half of the time of Pillow's filters."""
+    import cv2
+    from PIL.Image import fromarray
+
+    return fromarray(cv2.resize(np.asarray(rgb), size, interpolation=cv2.INTER_AREA))
 
 
 def _deep(image: Image, shot: Shot) -> Image:
