@@ -105,7 +105,7 @@ def test_demo_renders_reconstructs_and_measures(engine: None, tmp_path: Path) ->
 
 def test_demo_leaves_other_folders_alone(engine: None, tmp_path: Path) -> None:
     (tmp_path / "holiday.jpg").touch()
-    with pytest.raises(InputError, match="name a new folder"):
+    with pytest.raises(InputError, match="name another folder"):
         run_demo(tmp_path, survey_options=SMALL)
     assert [path.name for path in tmp_path.iterdir()] == ["holiday.jpg"]
 

@@ -75,6 +75,13 @@ class StorageError(OnTheFly3RError):
     exit_code = 4
 
 
+def require_memory(error: ImportError | OSError) -> None:
+    """Raise `MemoryError` when a module could not be loaded because memory lacks, which looks as if it were missing."""
+    signs = ("cannot allocate memory", "failed to map segment", "out of memory", "not enough memory", "paging file")
+    if any(sign in str(error).lower() for sign in signs):
+        raise MemoryError(f"no memory is left to load a library ({error})") from error
+
+
 class Cancelled(OnTheFly3RError):
     """The caller asked to stop."""
 

@@ -7,7 +7,7 @@ import importlib
 from collections.abc import Callable
 from importlib import metadata
 
-from ..errors import MissingDependencyError, OptionError
+from ..errors import MissingDependencyError, OptionError, require_memory
 from ..features.extraction import FeatureStore
 from ..options import BackboneOptions
 from .base import Backbone
@@ -45,6 +45,7 @@ def load_backbone(name: str) -> Callable[..., Backbone]:
     try:
         factory: Callable[..., Backbone] = getattr(importlib.import_module(module), attribute)
     except ImportError as error:
+        require_memory(error)
         raise MissingDependencyError(f"backbone {name}: cannot be imported ({error}); install what it names") from error
     except AttributeError as error:
         raise MissingDependencyError(f"backbone {name}: {module} has no {attribute}; update that package") from error

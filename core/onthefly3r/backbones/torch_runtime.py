@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..errors import MissingDependencyError, OptionError
+from ..errors import MissingDependencyError, OptionError, require_memory
 from ..geometry.camera import Camera
 from ..networks.torch_tools import (
     autocast_dtype,
@@ -160,6 +160,7 @@ class TorchBackbone(ABC):
             with quiet_upstream():
                 network, state = self.build(read_state(weights.path), weights.config)
         except ImportError as error:
+            require_memory(error)
             raise MissingDependencyError(
                 f"backbone {self.card.name}: its upstream code cannot be imported ({error}); install what it names"
             ) from error

@@ -20,6 +20,8 @@ from typing import Any, Literal
 
 from ..errors import Cancelled, InputError, OptionError, ReconstructionError
 from ..files.atomic import write_text
+from ..files.owned import OwnedFolder
+from ..files.ownership import WORK
 from ..intake.folder import find_photographs
 from ..options import Options, over_earlier
 from ..protocol import Event, Job, Progress, ProgressCallback
@@ -27,6 +29,7 @@ from ..protocol import Event, Job, Progress, ProgressCallback
 Status = Literal["done", "failed", "skipped"]
 
 MAX_TABLE_BYTES = 16 * 1024 * 1024
+TABLE = "flights.csv"
 OWN_COLUMNS = ("name", "photos")
 SOURCE = Path(__file__).resolve().parents[2]  # a flight runs by the same source as the batch
 POLL_S = 0.1
@@ -95,20 +98,24 @@ def reconstruct_flights(
         skip_done: leave flights alone whose report tells of no error.
         progress: told how far all flights are, in hundredths of a flight.
         cancel: asked while a flight runs; true ends it, and raises `Cancelled`.
+
+    Raises `InputError` when `out` holds a flights.csv that is not ours, and as `OwnedFolder.claim` does.
     """
-    out.mkdir(parents=True, exist_ok=True)
     rows: list[FlightResult] = []
-    for number, flight in enumerate(flights):
-        folder = out / flight.name
-        if skip_done and _succeeded(folder):
-            row = _result(flight, folder, "skipped", "done before")
-        else:
-            follow = _follower(progress, number, len(flights), flight.name)
-            row = _reconstruct(flight, folder, options, follow, cancel)
-        rows.append(row)
-        write_table(out / "flights.csv", rows)
-        if progress is not None:
-            progress(Progress(flight.name, 100 * (number + 1), 100 * len(flights), message=row.status))
+    with OwnedFolder.claim(out, "batch", names=(TABLE,), guest=True) as owned:
+        for number, flight in enumerate(flights):
+            folder = out / (f"{flight.name}_" if flight.name.casefold() == WORK else flight.name)
+            if skip_done and _succeeded(folder):
+                row = _result(flight, folder, "skipped", "done before")
+            else:
+                follow = _follower(progress, number, len(flights), flight.name)
+                row = _reconstruct(flight, folder, options, follow, cancel)
+            rows.append(row)
+            with owned.scratch() as made:
+                write_table(made / TABLE, rows)
+                owned.publish(made, "flights")
+            if progress is not None:
+                progress(Progress(flight.name, 100 * (number + 1), 100 * len(flights), message=row.status))
     return rows
 
 

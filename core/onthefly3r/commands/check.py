@@ -21,6 +21,7 @@ import numpy as np
 from ..earth.positions import Positions, usable_positions
 from ..errors import Cancelled, PhotographError
 from ..files.atomic import write_text
+from ..files.owned import OwnedFolder
 from ..geometry.arrays import Float
 from ..geometry.camera import Camera
 from ..geometry.frames import enu_from_cam_rotation
@@ -39,6 +40,7 @@ from .flying_height import measured_height_m
 
 Verdict = Literal["good", "doubtful", "unusable"]
 
+CHECK_FILES = ("check.json", "check.csv")
 BLURRED_SHARE = 0.75  # of the flight's median sharpness: sharp flights stay above 0.85, a blur of 1 px is below 0.7
 BLURRED = 0.5  # however blurred the rest of the flight is
 LOST_SHARE = 0.25  # of the pixels black or white
@@ -160,16 +162,21 @@ def check_photographs(
 
 
 def write_check(out: Path, checked: FlightCheck) -> Path:
-    """Write check.json and, for spreadsheets, check.csv into `out`; return the first."""
+    """Write check.json and, for spreadsheets, check.csv into `out`; return the first.
+
+    Raises as `OwnedFolder.claim` does: files of these names that are not ours are left alone.
+    """
     document = {"summary": checked.summary(), "photographs": [asdict(row) for row in checked.photographs]}
-    write_text(out / "check.json", json.dumps(document, ensure_ascii=False, indent=1, allow_nan=False))
     table = io.StringIO()
     columns = [name for name in CheckedPhotograph.__dataclass_fields__ if name != "footprint"]
     writer = csv.DictWriter(table, columns, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows({**asdict(row), "problems": "; ".join(row.problems)} for row in checked.photographs)
-    write_text(out / "check.csv", table.getvalue())
-    return out / "check.json"
+    with OwnedFolder.claim(out, "check", names=CHECK_FILES, guest=True) as folder, folder.scratch() as made:
+        write_text(made / CHECK_FILES[0], json.dumps(document, ensure_ascii=False, indent=1, allow_nan=False))
+        write_text(made / CHECK_FILES[1], table.getvalue())
+        folder.publish(made, "check")
+    return out / CHECK_FILES[0]
 
 
 # ---------------------------------------------------------------------- pixels

@@ -1,6 +1,7 @@
 """The command line: run, batch, check, export, evaluate, simulate, demo, doctor, view.
 
-Exit codes: 0 done, 2 the input is wrong, 3 nothing reconstructed or georeferenced, 130 cancelled, 1 unexpected.
+Exit codes: 0 done, 2 the input is wrong, 3 nothing reconstructed or georeferenced, 4 no room or no access,
+130 cancelled, 1 unexpected.
 """
 
 from __future__ import annotations
@@ -126,8 +127,10 @@ def check(
     with session(json_lines=json, out=out) as here:
         options = run_options(values)
         _require_folder(photos, "PHOTOS")
-        from .check import check_photographs, write_check
+        from ..files.owned import OwnedFolder
+        from .check import CHECK_FILES, check_photographs, write_check
 
+        OwnedFolder.require(out, CHECK_FILES, guest=True)
         checked = check_photographs(photos, options, above_ground_m, here.progress, here.cancelled)
         summary = checked.summary()
         for warning in summary["warnings"]:

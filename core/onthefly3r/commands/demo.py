@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError
 from ..evaluate.clouds import open_cloud
 from ..evaluate.poses import PoseSet, match
 from ..evaluate.readers import read_trajectory_csv
 from ..evaluate.trajectory_errors import pose_errors
+from ..files.atomic import write_text
+from ..files.owned import OwnedFolder
 from ..geometry.arrays import Float
 from ..geometry.geodesy import EnuFrame, WorldFrame
 from ..options import Options
@@ -71,15 +72,13 @@ def run_demo(
     from ..simulate import simulate_survey
     from ..simulate.flight import SurveyOptions
 
-    if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / "truth" / "origin.json").exists())):
-        raise InputError(f"{out} exists and is not an earlier demonstration: name a new folder")
     survey = simulate_survey(out, survey_options or SurveyOptions(), progress)
     options = Options()
     result = reconstruct(out / "photos", out / "result", options, progress, cancel)
     accuracy = compare_with_truth(result.report, out / "result", survey, options)
-    part = out / "accuracy.json.part"
-    part.write_text(json.dumps(asdict(accuracy), indent=1), encoding="utf-8")
-    part.replace(out / "accuracy.json")
+    with OwnedFolder.claim(out, "demo") as folder, folder.scratch() as made:
+        write_text(made / "accuracy.json", json.dumps(asdict(accuracy), indent=1))
+        folder.publish(made, "accuracy")
     return Demo(out, result, accuracy)
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 
 from ..backbones.base import Backbone, ExtractsFeatures, Interruptible
 from ..earth.blockadjust import adjust_block
-from ..errors import Cancelled, PhotographError
+from ..errors import Cancelled, OnTheFly3RError, PhotographError
 from ..geometry.arrays import Float
 from ..geometry.transforms import Sim3
 from ..graph.gpsprior import GpsTie, gps_disagreement, pose_priors, tie_to_positions
@@ -425,7 +426,7 @@ class Engine:
         """Tie the map to the positions as it is now, and remove its drift."""
         self._drift_shows = False
         graph = self.options.pose_graph
-        with self.stopwatch.stage("pose graph"):
+        with self.stopwatch.stage("pose graph"), self._optional("the pose graph"):
             self._settled_submaps = len(self.state.map_from_submap)
             if graph.gps_priors or self.options.registration.gps_check:
                 self._tie = tie_to_positions(self.state, self.shots, self.options.georeference)
@@ -441,13 +442,27 @@ class Engine:
     def _refine(self) -> None:
         with self.stopwatch.stage("refinement"):
             self._checkpoint("refining the cameras", 0, 1)
-            adjusted = adjust_block(self.state, self.store.stream_observations(), self.shots, self.options)
-            if adjusted is not None:
-                self.state.move_refined(adjusted.refinement.map_from_submap, adjusted.refinement.calibrations)
-                self.refinement = adjusted.refinement.notes
-                self.warnings += adjusted.warnings
-                if adjusted.tie is not None:
-                    self.state.set_tie(adjusted.tie)
+            with self._optional("the refinement"):
+                adjusted = adjust_block(self.state, self.store.stream_observations(), self.shots, self.options)
+                if adjusted is not None:
+                    self.state.move_refined(adjusted.refinement.map_from_submap, adjusted.refinement.calibrations)
+                    self.refinement = adjusted.refinement.notes
+                    self.warnings += adjusted.warnings
+                    if adjusted.tie is not None:
+                        self.state.set_tie(adjusted.tie)
+
+    @contextlib.contextmanager
+    def _optional(self, stage: str) -> Iterator[None]:
+        """Let a stage that makes the map better fail: solvers raise errors of their own, and the map is worth more."""
+        try:
+            yield
+        except (OnTheFly3RError, OSError):
+            raise
+        except Exception as error:
+            self.warnings.append(
+                f"{stage} failed ({type(error).__name__}: {error}): the cameras are as they were before it, "
+                "less accurate than they could be"
+            )
 
     def _stop_if_cancelled(self) -> None:
         if self._cancel is not None and self._cancel():

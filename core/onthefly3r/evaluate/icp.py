@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import MissingDependencyError, ReferenceFormatError
+from ..errors import MissingDependencyError, ReferenceFormatError, require_memory
 from ..geometry.arrays import Float
 from ..geometry.spacing import point_spacing
 from ..geometry.transforms import Sim3
@@ -65,7 +65,8 @@ def import_open3d() -> Any:
         if error.name != "open3d":
             raise MissingDependencyError(f"open3d needs {error.name}: pip install 'onthefly3r[cloud]'") from None
         raise MissingDependencyError("this needs open3d: pip install 'onthefly3r[cloud]'") from None
-    except (ImportError, OSError) as error:  # a shared library that the wheel does not bring
+    except (ImportError, OSError) as error:
+        require_memory(error)  # else it is a shared library that the wheel does not bring
         raise MissingDependencyError(
             f"open3d does not start ({error}); on Debian and Ubuntu: {SYSTEM_LIBRARIES}"
         ) from None

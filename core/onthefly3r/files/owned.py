@@ -55,8 +55,7 @@ class OwnedFolder:
             StorageError: the folder cannot be written, or the disk is too full.
         """
         path = Path(path)
-        before = cls._look(path, names, guest)
-        require_access(path)
+        before = cls.require(path, names, guest)
         require_room(path, need_bytes, f"'{verb}'")
         with storage_errors(path):
             made = _make_folder(path)
@@ -74,6 +73,13 @@ class OwnedFolder:
         finally:
             lock.release()
             _remove_if_empty(made)
+
+    @classmethod
+    def require(cls, path: Path, names: Iterable[str] = (), guest: bool = False) -> Stamp | None:
+        """Raise as `claim` does for what can be told without a write; return the folder's stamp."""
+        stamp = cls._look(Path(path), names, guest)
+        require_access(Path(path))
+        return stamp
 
     @classmethod
     def _look(cls, path: Path, names: Iterable[str], guest: bool) -> Stamp | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 from ..earth.control_reference import earth_reference
 from ..earth.georef import metres_per_map_unit
 from ..earth.ground import ground_normal
-from ..errors import Cancelled, ReconstructionError
+from ..errors import Cancelled, GeoreferenceError, ReconstructionError
 from ..files.las_index import indexes_beside, indexes_of
 from ..map.state import MapState
 from ..map.store import Store
@@ -137,14 +137,15 @@ def _export(
         )
     with stopwatch.stage("georeference"):
         checkpoint("georeferencing", 0, 1)
-        up = ground_normal(state)
         poses = {index: state.map_from_cam(index) for index in state.frames}
-        if options.georeference.local:
-            metres_per_unit = metres_per_map_unit(poses, record.shots, options.georeference)
-            if metres_per_unit is None:
-                warnings.append("no positions tell the scale: the units of the local frame are not metres")
-        else:
-            reference = earth_reference(state.tie, poses, record.shots, options.georeference, up)
+        with _solver_errors():
+            up = ground_normal(state)
+            if options.georeference.local:
+                metres_per_unit = metres_per_map_unit(poses, record.shots, options.georeference)
+                if metres_per_unit is None:
+                    warnings.append("no positions tell the scale: the units of the local frame are not metres")
+            else:
+                reference = earth_reference(state.tie, poses, record.shots, options.georeference, up)
     with stopwatch.stage("export"):
         view = RunView(
             title=folder.path.resolve().name,
@@ -162,6 +163,22 @@ def _export(
         )
         cloud = write_products(made, view).get("cloud")
     return _summary(mapped, options, stopwatch, reference, cloud, warnings, None)
+
+
+@contextlib.contextmanager
+def _solver_errors() -> Iterator[None]:
+    """Raise `GeoreferenceError` for the errors of numpy's and scipy's solvers, which say nothing to a user."""
+    try:
+        yield
+    except (
+        ValueError,
+        ArithmeticError,
+        RuntimeError,
+    ) as error:  # LinAlgError is a ValueError, SuperLU's a RuntimeError
+        raise GeoreferenceError(
+            f"the map cannot be tied to its positions ({type(error).__name__}: {error}); 'onthefly3r export' with "
+            "--local or other --positions writes it"
+        ) from error
 
 
 def _summary(

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..files.owned import OwnedFolder, relative_files, require_free
-from ..files.ownership import MAP, WORK, Listed, Stamp, fingerprint, read_stamp
+from ..files.ownership import CRASH_NOTE, MAP, WORK, Listed, Stamp, fingerprint, read_stamp
 from ..files.room import storage_errors
 from ..products.catalogue import PRODUCTS
 
@@ -23,10 +23,10 @@ PRODUCT_FILES = tuple(name for product in PRODUCTS for name in product.files)
 MAX_REPORT_BYTES = 64 * 2**20
 
 _PART = r"\.onthefly3r-[0-9a-f]{16}\.part"
-_MAP_FILE = re.compile(
-    rf"journal\.jsonl|run\.json|crash\.txt|{_PART}\.json|(chunks|features)/(\d{{6}}(\.part)?|{_PART})\.npz"
-)
-_MAP_NAMES = ("journal.jsonl", "run.json", "chunks", "features")
+_ARRAYS = rf"(chunks|features)/(\d{{6}}(\.part)?|{_PART})\.npz"
+_MAP_FILE = re.compile(rf"journal\.jsonl|run\.json|{re.escape(CRASH_NOTE)}|{_PART}\.(json|txt)|{_ARRAYS}")
+FOLDERS = ("chunks", "features")  # below `work`
+_MAP_NAMES = ("journal.jsonl", "run.json", *FOLDERS)
 
 
 class RunFolder(OwnedFolder):
@@ -120,7 +120,7 @@ class RunFolder(OwnedFolder):
     def _remove_open_map(self) -> None:
         for name in _map_files(self.path / WORK):
             (self.path / name).unlink(missing_ok=True)
-        for name in ("chunks", "features"):
+        for name in FOLDERS:
             with contextlib.suppress(OSError):  # not there, or it holds what is not ours
                 (self.path / WORK / name).rmdir()
         self.stamp.map_open = False

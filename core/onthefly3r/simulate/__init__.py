@@ -6,6 +6,7 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from ..files.owned import OwnedFolder
 from ..protocol import Progress, ProgressCallback
 from .flight import Survey, SurveyOptions, TrueView, plan_survey
 from .photographs import render, write_photograph
@@ -17,11 +18,18 @@ __all__ = ["Survey", "SurveyOptions", "TrueView", "plan_survey", "simulate_surve
 def simulate_survey(out: Path, options: SurveyOptions, progress: ProgressCallback | None = None) -> Survey:
     """Render a survey into out/photos/*.JPG and write its truth into out/truth/; return the survey.
 
-    The same options give the same survey. Raises `OptionError` for a plan that cannot be flown, and whatever
-    `progress` raises, which ends the rendering early.
+    The same options give the same survey; an earlier one in `out` is replaced as a whole. Raises `OptionError` for a
+    plan that cannot be flown, as `OwnedFolder.claim` does when `out` is not ours, and whatever `progress` raises,
+    which ends the rendering early and leaves what was there.
     """
     survey = plan_survey(options)
+    with OwnedFolder.claim(Path(out), "simulate") as folder, folder.scratch() as made:
+        _render(made, survey, progress)
+        folder.publish(made, "survey")
+    return survey
 
+
+def _render(out: Path, survey: Survey, progress: ProgressCallback | None) -> None:
     def photograph(view: TrueView) -> None:
         write_photograph(out / "photos" / view.name, render(survey.scene, view), view)
 
@@ -37,4 +45,3 @@ def simulate_survey(out: Path, options: SurveyOptions, progress: ProgressCallbac
             raise
     if progress is not None:
         progress(Progress("simulate", count, count))
-    return survey
