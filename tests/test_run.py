@@ -28,6 +28,7 @@ FILES = (
     *("cloud.laz", "trajectory.csv", "preview.png", "report.json", "report.html"),
     *(f"{name}{suffix}" for name in ("cameras", "footprints") for suffix in (".shp", ".shx", ".dbf", ".prj", ".cpg")),
     *(f"colmap/{name}{suffix}" for name in ("cameras", "images", "points3D") for suffix in (".txt", ".bin")),
+    *("colmap/offset.txt", "colmap/offset.json"),
 )
 
 

@@ -74,8 +74,8 @@ def block_of(state: PlacedMap, observed: Iterable[tuple[int, Observations]], sho
     images = images_of(tracks)
     if len(images) < MIN_IMAGES:
         return None
-    bundle = _bundle(tracks, images, state, shots)
-    return Block(tracks, images, bundle, _start(tracks, images, state, bundle.free))
+    bundle = bundle_of(tracks, images, state, shots)
+    return Block(tracks, images, bundle, start_of(tracks, images, state, bundle.free))
 
 
 def calibrated(block: Block, principal_point: PrincipalPoint) -> Calibrated | None:
@@ -112,14 +112,15 @@ def refinement(block: Block, solved: Calibrated, state: PlacedMap) -> Refinement
 def _plausible(tracks: Tracks, state: PlacedMap, shots: Mapping[int, Shot]) -> Bool:
     """Return which observations (M,) lie in front of their cameras and not absurdly far from where they should be."""
     images = images_of(tracks)
-    bundle = _bundle(tracks, images, state, shots)
-    residual = np.linalg.norm(bundle.residuals(_start(tracks, images, state, bundle.free)), axis=1)
+    bundle = bundle_of(tracks, images, state, shots)
+    residual = np.linalg.norm(bundle.residuals(start_of(tracks, images, state, bundle.free)), axis=1)
     longest = np.array([max(shots[i].width_px, shots[i].height_px) for i in images])
     # False where the residual is NaN, behind the camera.
     return np.asarray(residual <= ABSURD * longest[np.searchsorted(np.array(images), tracks.image)])
 
 
-def _bundle(tracks: Tracks, images: tuple[int, ...], state: PlacedMap, shots: Mapping[int, Shot]) -> Bundle:
+def bundle_of(tracks: Tracks, images: tuple[int, ...], state: PlacedMap, shots: Mapping[int, Shot]) -> Bundle:
+    """Return the tracks as a bundle, photographs at full size, one row for each of the images, all free."""
     row = np.searchsorted(np.array(images), tracks.image)
     keys = tuple(shots[i].camera_key for i in images)
     free = tuple(sorted(set(keys) & set(state.calibrations)))
@@ -150,7 +151,8 @@ def _camera(index: int, state: PlacedMap, shots: Mapping[int, Shot]) -> Camera:
     return frame.camera.through(frame.grid_from_photo.inverse(), shot.width_px, shot.height_px)
 
 
-def _start(tracks: Tracks, images: tuple[int, ...], state: PlacedMap, free: tuple[str, ...]) -> State:
+def start_of(tracks: Tracks, images: tuple[int, ...], state: PlacedMap, free: tuple[str, ...]) -> State:
+    """Return the state of a bundle as the map has it."""
     poses = [state.map_from_cam(i) for i in images]
     return State(
         rotations=np.array([pose.rotation for pose in poses]),

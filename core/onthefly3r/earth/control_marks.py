@@ -11,6 +11,7 @@ import numpy as np
 from ..adjust.intrinsics import projection_jacobians
 from ..geometry.arrays import Bool, Float, Int
 from ..geometry.camera import Camera
+from ..geometry.orientation import upright_pixels
 from ..geometry.transforms import Rigid3
 from ..records import Shot
 from .control import Control, Mark
@@ -202,30 +203,11 @@ def _in_photographs(
 
 def _oriented(pixel: Float, sizes: Float, turn: Int, stored: bool) -> Float:
     """Return marks in upright photographs; those that lie outside are tried in the other orientation."""
-    from_stored = stored_to_upright(pixel, sizes, turn)
+    from_stored = np.array(
+        [upright_pixels(one, size[0], size[1], int(code)) for one, size, code in zip(pixel, sizes, turn, strict=True)]
+    ).reshape(-1, 2)
     first, second = (from_stored, pixel) if stored else (pixel, from_stored)
     return np.where(_inside(first, sizes)[:, None], first, second)
-
-
-def stored_to_upright(pixel: Float, upright_size: Float, orientation: Int) -> Float:
-    """Map pixels (M, 2) of files as stored to their upright photographs of sizes (M, 2), EXIF orientations (M,)."""
-    x, y = pixel[:, 0], pixel[:, 1]
-    width, height = upright_size[:, 0], upright_size[:, 1]
-    mapped = {
-        1: (x, y),
-        2: (width - x, y),
-        3: (width - x, height - y),
-        4: (x, height - y),
-        5: (y, x),
-        6: (width - y, x),
-        7: (width - y, height - x),
-        8: (y, height - x),
-    }
-    result = np.array(pixel, float)
-    for code, (u, v) in mapped.items():
-        rows = orientation == code
-        result[rows] = np.stack([u, v], axis=1)[rows]
-    return result
 
 
 def _inside(pixel: Float, sizes: Float) -> Bool:

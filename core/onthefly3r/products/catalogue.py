@@ -13,12 +13,11 @@ from typing import Any, Literal
 
 from ..options import ExportOptions
 from .cloudpass import Sink, cloud_spacing_m
-from .colmap import write_model
 from .footprints import write_footprints
 from .las import CloudWriter, las_scale_m
 from .preview import write_preview
 from .runview import RunView
-from .sparsepoints import sparse_points
+from .sparsepoints import write_colmap
 from .trajectory_table import write_trajectory
 from .vector import write_cameras
 
@@ -89,7 +88,7 @@ def _trajectory(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
 
 
 def _model(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
-    write_model(out / "colmap", view.cameras, sparse_points(view.state, view.frame))
+    write_colmap(out / "colmap", view.cameras, view.state, view.store, view.shots, view.frame)
 
 
 def _preview(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
@@ -115,7 +114,11 @@ PRODUCTS: tuple[Product, ...] = (
     Product(
         "colmap",
         "COLMAP model",
-        tuple(f"colmap/{name}.{suffix}" for name in ("cameras", "images", "points3D") for suffix in ("txt", "bin")),
+        (
+            *(f"colmap/{name}.{suffix}" for name in ("cameras", "images", "points3D") for suffix in ("txt", "bin")),
+            "colmap/offset.txt",
+            "colmap/offset.json",
+        ),
         _always,
         _model,
     ),
