@@ -51,13 +51,18 @@ class Recorder(OracleBackbone):
 class WatchedEngine(Engine):
     """The engine, which measures its error before and after each time it removes drift."""
 
-    survey: Survey
-    settled: list[tuple[float, float]]
+    def __init__(self, survey: Survey, *args: Any) -> None:
+        super().__init__(*args)
+        self.survey = survey
+        self.optimised: list[tuple[float, float]] = []
+        optimise = self.drift.optimise
 
-    def _settle(self) -> None:
-        before = ate_m(self, self.survey)
-        super()._settle()
-        self.settled.append((before, ate_m(self, self.survey)))
+        def watched(fragment: int) -> None:
+            before = ate_m(self, survey)
+            optimise(fragment)
+            self.optimised.append((before, ate_m(self, survey)))
+
+        self.drift.optimise = watched  # type: ignore[method-assign]
 
 
 @dataclass(frozen=True)
@@ -72,9 +77,9 @@ class Outcome:
     work: Path
 
     @property
-    def settled(self) -> list[tuple[float, float]]:
+    def optimised(self) -> list[tuple[float, float]]:
         """ATE before and after each optimisation, m."""
-        return self.engine.settled
+        return self.engine.optimised
 
 
 def run(
@@ -101,8 +106,7 @@ def run(
         return by_name[shot.name]
 
     backbone = Recorder(survey, noise, faults, seed, tokens, GRID_PX)
-    engine = WatchedEngine(work, Options.from_flat(options), backbone, OracleDescriber(survey, seed=seed), load)
-    engine.survey, engine.settled = survey, []
+    engine = WatchedEngine(survey, work, Options.from_flat(options), backbone, OracleDescriber(survey, seed=seed), load)
     shots = shots or oracle_shots(survey)
     if live:
         for shot in shots:

@@ -64,7 +64,7 @@ def test_cases_of_the_papers_ablation(tmp_path: Path, case: int) -> None:
         arrivals = [i for subset in asked for i in subset.new]
         assert arrivals == sorted(arrivals) and {len(subset.new) for subset in asked} == {5}
     if CASES[case]["validation"]:
-        assert outcome.engine.pruned_references > 0 or outcome.engine.rejections
+        assert outcome.engine.details()["pruned_references"] > 0 or outcome.engine.rejections
     else:
         assert outcome.coverage == 1.0 and not outcome.engine.rejections
         assert outcome.worst_m > 20.0  # what was bad is in the map
@@ -123,7 +123,7 @@ def test_one_by_one_gives_a_map_before_the_end(tmp_path: Path) -> None:
         Options(),
         run(tmp_path / "oracle", survey).backbone,
         OracleDescriber(survey),
-        run(tmp_path / "images", survey).engine._images._load,
+        run(tmp_path / "images", survey).engine.images._load,
     )
     for shot in oracle_shots(survey):
         engine.add(shot)
@@ -139,20 +139,20 @@ def empty_engine(work: Path, **named: object) -> Engine:
     survey = survey_of(60, 4)
     outcome = run(work / "first", survey)
     return Engine(
-        work / "second", Options(), outcome.backbone, OracleDescriber(survey), outcome.engine._images._load, **named
+        work / "second", Options(), outcome.backbone, OracleDescriber(survey), outcome.engine.images._load, **named
     )  # type: ignore[arg-type]
 
 
 def test_unreadable_photographs_are_reported_and_stop_nothing(tmp_path: Path) -> None:
     engine = empty_engine(tmp_path)
-    load = engine._images._load
+    load = engine.images._load
 
     def sometimes(shot: object) -> object:
         if shot.name.endswith("07.JPG"):  # type: ignore[attr-defined]
             raise PhotographError(Path("x.JPG"), "its pixels are damaged")
         return load(shot)  # type: ignore[arg-type]
 
-    engine._images._load = sometimes  # type: ignore[assignment]
+    engine.images._load = sometimes  # type: ignore[assignment]
     engine.add_all(oracle_shots(survey_of(60, 4)))
     engine.finish()
     assert set(engine.rejections) == {6}
@@ -172,7 +172,7 @@ def test_images_that_share_nothing_leave_reasons(tmp_path: Path) -> None:
 def test_while_images_arrive_no_seed_is_the_last(tmp_path: Path) -> None:
     """Most images of every seed are bad: attempts go on as more arrive, and nothing is given up before the end."""
     engine = empty_engine(tmp_path)
-    engine._backbone = OracleBackbone(
+    engine.backbone = OracleBackbone(
         survey_of(60, 4), None, Faults(bad_queries=28, bad_query_rate=1.0, in_seed=True), 0, False, GRID_PX
     )
     calls = []
@@ -217,7 +217,7 @@ class Vanishing:
 def test_photographs_that_go_meanwhile_are_left_out(tmp_path: Path, calls: int) -> None:
     """Before the seed all three are lost; later those that are in the map stay, and no more is asked of them."""
     engine = empty_engine(tmp_path)
-    engine._backbone = Vanishing(engine._backbone, calls)  # type: ignore[arg-type]
+    engine.backbone = Vanishing(engine.backbone, calls)  # type: ignore[arg-type]
     engine.add_all(oracle_shots(survey_of(60, 4)))
     engine.finish()
     lost = [i for i in Vanishing.gone if i not in engine.state.frames]

@@ -177,6 +177,12 @@ class RegistrationOptions(CheckedOptions):
         minimum=0.0,
         advanced=True,
     )
+    fragments: bool = option(
+        True,
+        "let photographs that hang together apart from the map begin a part of their own, and join parts that meet; "
+        "off keeps the single map of the paper",
+        advanced=True,
+    )
     validate_queries: bool = option(
         True, "check the new images against the map too, not only the references", advanced=True
     )
@@ -356,6 +362,7 @@ PAPER_VALUES: dict[str, Any] = {
     "subset_references": 5,
     "gps_candidates": False,
     "reference_gate": 0.0,
+    "fragments": False,
     "validate_queries": False,
     "gps_check": False,
     "max_retries": 0,

@@ -199,6 +199,7 @@ class Rejection:
     stage: str  # intake, retrieval, seed, backbone, alignment, references, queries
     reason: str
     numbers: Mapping[str, float] = field(default_factory=dict)
+    neighbours: Mapping[int, str] = field(default_factory=dict)  # references that were looked at: why each did not do
 
 
 @dataclass(frozen=True)

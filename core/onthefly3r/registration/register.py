@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -31,6 +31,7 @@ from .validate import (
     MISFIT_GATE,
     PoseResidual,
     ReferenceVerdict,
+    pose_residuals,
     reference_misfit,
     reference_points_in_map,
     validate_query,
@@ -67,6 +68,7 @@ def register(
 ) -> Registration | Rejection:
     """Register a local model to the map (Eq. 10-13 with geometric pruning); a misfit is a `Rejection`.
 
+    A subset without new images tells only where its references lie; a misfit names why each of them did not do.
     `far_from_position` tells how far a new image, by its centre in the map, is from where its position says, over
     what is allowed, given the centres of the references.
     """
@@ -75,8 +77,9 @@ def register(
     map_from_cam = {i: state.map_from_cam(i) for i in references}
     pairs = correspond(model, references, poses, min_confidence)
     placed = tuple(i for i in subset.new if i in model.views)
-    if not placed:
-        return Rejection(subset.new, "backbone", "no new image could be tied to the subset")
+    if subset.new and not placed:
+        told = dict.fromkeys(references, "was placed without it")
+        return Rejection(subset.new, "backbone", "no new image could be tied to the subset", {}, told)
 
     def validate(alignment: Alignment) -> ReferenceVerdict:
         return validate_references(model, alignment, map_from_cam, state.spacing, options)
@@ -87,7 +90,8 @@ def register(
         aligned = align(pairs, subset.new)
         outcome = aligned if isinstance(aligned, Rejection) else (aligned, validate(aligned))
     if isinstance(outcome, Rejection):
-        return Rejection(subset.new, outcome.stage, outcome.reason, outcome.numbers)
+        told = _why_not(subset.references, model, pairs, map_from_cam)
+        return Rejection(subset.new, outcome.stage, outcome.reason, outcome.numbers, told)
     alignment, verdict = outcome
     kept = alignment.references
     refused = [
@@ -113,7 +117,7 @@ def register(
             if reason:
                 accepted.remove(index)
                 refused.append(Rejection((index,), "queries", reason, numbers))
-    if not accepted:
+    if subset.new and not accepted:
         first = refused[0]
         return Rejection(subset.new, first.stage, first.reason, first.numbers)
     return Registration(
@@ -124,6 +128,25 @@ def register(
         refused=tuple(refused),
         pruned=tuple(i for i in references if i not in kept),
     )
+
+
+def _why_not(
+    references: Sequence[int], model: LocalModel, pairs: Correspondences, map_from_cam: Mapping[int, Rigid3]
+) -> dict[int, str]:
+    """Return, for each reference of a model that did not fit, what came of it."""
+    aligned = align(pairs)
+    told = {}
+    for index in references:
+        if index not in model.views:
+            told[index] = "shares too little with the others"
+        elif not (pairs.reference == index).any():
+            told[index] = "has no points in common with the map"
+        elif isinstance(aligned, Rejection):
+            told[index] = "could not be aligned"
+        else:
+            (residual,) = pose_residuals(model, aligned.map_from_local, map_from_cam, (index,))
+            told[index] = f"is turned by {residual.rotation_deg:.1f} degrees against the map"
+    return told
 
 
 def check_seed(views: Mapping[int, LocalView], min_confidence: float) -> dict[int, Rejection]:

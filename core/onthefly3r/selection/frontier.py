@@ -7,17 +7,19 @@ its near neighbours among all images are in the subset.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from ..geometry.arrays import Float
+from ..geometry.arrays import Bool, Float, Int
 from ..records import Subset
 from .index import RetrievalIndex
 
 NEAREST = 12  # so many images seen so far are an image's near neighbours: ranks mean the same for any descriptor
 NEIGHBOURS = 3  # of them must be in the subset: fewer references are not enough to register an image
 BLOCK = 1000  # rows of similarities at a time
+MOST_LOOKED_AT = 2000  # waiting images among which a group is looked for
+ROUNDING = 1e-6
 
 
 class Frontier:
@@ -63,6 +65,51 @@ class Frontier:
             return bool((_highest(joined, NEIGHBOURS).min(axis=1) >= least[rows]).all())
 
         return supported
+
+    def least(self, images: Sequence[int]) -> Float:
+        """Return the similarity (N,) from which on another image is among the near neighbours of each."""
+        return np.asarray(self._to_all[[self._row_of[index] for index in images]].min(axis=1))
+
+    def hanging_together(
+        self, images: Sequence[int], retrieval: RetrievalIndex, first: Sequence[int] = ()
+    ) -> list[int]:
+        """Return those images that have enough near neighbours among each other, as far as links connect them.
+
+        The largest such group, or that of the first one of `first`, in the order given.
+        """
+        kept = list(images)[:MOST_LOOKED_AT]
+        while True:
+            near = self._near(kept, kept, retrieval)
+            enough = near.sum(axis=1) >= NEIGHBOURS
+            if enough.all():
+                break
+            kept = [index for index, is_held in zip(kept, enough, strict=True) if is_held]
+        if not kept or (first and first[0] not in kept):
+            return []
+        group = _connected(near | near.T)
+        wanted = group[kept.index(first[0])] if first else np.bincount(group).argmax()
+        return [index for index, label in zip(kept, group, strict=True) if label == wanted]
+
+    def prefers(self, images: Sequence[int], others: Iterable[int], retrieval: RetrievalIndex) -> bool:
+        """Return whether images have at least as many near neighbours among others as among each other."""
+        among_others = self._near(images, list(others), retrieval).sum()
+        return bool(among_others >= self._near(images, images, retrieval).sum())
+
+    def _near(self, images: Sequence[int], others: Sequence[int], retrieval: RetrievalIndex) -> Bool:
+        """Return which others (N, M) are among the near neighbours of each image; nothing is its own."""
+        if not images or not others:
+            return np.zeros((len(images), len(others)), bool)
+        similarity = retrieval.similarities(images, others)
+        # What rounding takes off a similarity that was computed in another block must not matter.
+        near = similarity >= self.least(images)[:, None] - ROUNDING
+        return np.asarray(near & (np.array(images)[:, None] != np.array(others)[None, :]))
+
+
+def _connected(linked: Bool) -> Int:
+    """Return the number of the group of each image (N,), by a symmetric table of links (N, N)."""
+    from scipy.sparse.csgraph import connected_components
+
+    return np.asarray(connected_components(linked, directed=False)[1])
 
 
 def orphans(subset: Subset, kept: Sequence[int], retrieval: RetrievalIndex, min_shared: int) -> list[int]:

@@ -98,6 +98,14 @@ class RetrievalIndex:
         similarity = self._table[near] @ self._table[row]
         return [Neighbour(int(self._index_of[n]), float(s)) for n, s in zip(near, similarity, strict=True)]
 
+    def nearest_across(self, first: Sequence[int], second: Sequence[int]) -> Bool:
+        """Return the pairs (N, M) of which one is the nearest by position to the other."""
+        places = [self._positions[[self._row_of[i] for i in part]] for part in (first, second)]
+        distance = np.linalg.norm(places[0][:, None] - places[1][None], axis=2)
+        distance[~np.isfinite(distance)] = np.inf
+        nearest = (distance == distance.min(axis=0)[None, :]) | (distance == distance.min(axis=1)[:, None])
+        return np.asarray(nearest & np.isfinite(distance))
+
     def _similarity_rows(self, queries: Sequence[int]) -> list[Float]:
         """Return the similarities (N,) of each query to all images of the table."""
         count = len(self)

@@ -33,6 +33,16 @@ class RetryQueue:
     def __len__(self) -> int:
         return len(self._aside)
 
+    @property
+    def aside(self) -> list[int]:
+        """The images that wait here."""
+        return list(self._aside)
+
+    def reopen(self) -> None:
+        """Make every image worth another try: two fragments became one."""
+        for aside in self._aside.values():
+            aside.new_neighbours = max(aside.new_neighbours, ENOUGH_NEW_NEIGHBOURS)
+
     def set_aside(self, index: int, retrieval: RetrievalIndex, references: int) -> None:
         """Keep a rejected image that would take so many references."""
         best = retrieval.top([index], references)[index]

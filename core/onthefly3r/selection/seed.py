@@ -51,3 +51,27 @@ def choose_seed(
         attraction[chosen] = -np.inf
         chosen.append(int(np.argmax(attraction)))
     return tuple(candidates[i] for i in chosen)
+
+
+def hanging_together(
+    seed: tuple[int, ...], candidates: Sequence[int], similarities: Callable[[Sequence[int], Sequence[int]], Float]
+) -> tuple[int, ...]:
+    """Return the images of a seed that mutual nearest neighbours link to its first one, in their order.
+
+    A blob takes the size that is asked for, even where its images are of several places.
+    """
+    affinity = similarities(seed, candidates)
+    neighbours = min(CONNECTING_NEIGHBOURS, len(candidates) - 1)
+    if neighbours < 1:
+        return seed
+    column = {index: k for k, index in enumerate(candidates)}
+    own = np.array([column[index] for index in seed])
+    affinity[np.arange(len(seed)), own] = -np.inf
+    least = np.partition(affinity, -neighbours, axis=1)[:, -neighbours]
+    near = affinity[:, own] >= least[:, None]
+    linked = near & near.T
+    reached = np.zeros(len(seed), bool)
+    reached[0] = True
+    for _ in seed:
+        reached = reached | linked[reached].any(axis=0)
+    return tuple(index for index, is_reached in zip(seed, reached, strict=True) if is_reached)
