@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ class Drift:
         self.optimised_submaps: dict[int, int] = {}
         self.shows: set[int] = set()
         self.tie_of: dict[int, GpsTie] = {}
-        self.refinement: Mapping[str, float] = {}
+        self.refinement: Mapping[str, Any] = {}
 
     def note(self, fragment: int, residual: float) -> None:
         """Note how well a subset fitted a fragment."""

@@ -70,7 +70,7 @@ class Engine(Workbench):
         return self.retry.retries
 
     @property
-    def refinement(self) -> Mapping[str, float]:
+    def refinement(self) -> Mapping[str, Any]:
         """Figures of the refinement of the largest fragment."""
         return self.drift.refinement
 
