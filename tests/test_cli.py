@@ -343,7 +343,7 @@ def test_view_says_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     cases = {
         tmp_path: "onthefly3r[cloud]",
         tmp_path / "none.laz": "no such file",
-        tmp_path / "empty": "neither cloud.laz nor cloud.las",
+        tmp_path / "empty": "holds no cloud.laz",
         tmp_path / "broken.las": "not a LAS or LAZ file",
     }
     for path, told in cases.items():

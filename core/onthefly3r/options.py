@@ -281,7 +281,11 @@ class ExportOptions(CheckedOptions):
     cloud: bool = option(
         True, "write the point cloud; without it, cameras, footprints, COLMAP model and report are written"
     )
-    format: Literal["laz", "las"] = option("laz", "point cloud format", choices=("laz", "las"))
+    format: Literal["laz", "las", "copc"] = option(
+        "laz",
+        "point cloud format: LAZ, LAS, or COPC, a LAZ that QGIS and other viewers open at once however large it is",
+        choices=("laz", "las", "copc"),
+    )
     spacing_m: float | None = option(
         None,
         "voxel size of the cloud; default: the ground sampling distance of the point maps",
@@ -291,6 +295,36 @@ class ExportOptions(CheckedOptions):
     )
     min_confidence: float = option(0.5, "minimum confidence of a point of the cloud", minimum=0.0, maximum=1.0)
     stray_filter: bool = option(True, "remove isolated points")
+    ground: bool = option(True, "classify the points of the ground (class 2), and write a terrain model from them")
+    rasters: bool = option(True, "write the surface model, the terrain model and their confidence as GeoTIFF")
+    raster_m: float | None = option(
+        None,
+        "pixel size of the surface and terrain models; default: the spacing of the cloud",
+        unit="m",
+        minimum=0.0001,
+        example="0.1",
+    )
+    fill_holes: float = option(
+        0.0,
+        "close holes of the surface model whose middle is at most this far from their edge",
+        unit="m",
+        minimum=0.0,
+        maximum=1000.0,
+        example="2",
+    )
+    orthophoto: Literal["best", "fast", "none"] = option(
+        "best",
+        "best lays the photographs on the surface model at their full resolution; fast makes it four times coarser; "
+        "none leaves it out",
+        choices=("best", "fast", "none"),
+    )
+    ortho_m: float | None = option(
+        None,
+        "pixel size of the orthophoto; default: the ground sampling distance of the photographs",
+        unit="m",
+        minimum=0.0001,
+        example="0.05",
+    )
     boundary: str | None = option(
         None,
         "GeoJSON file of polygons in longitude and latitude (WGS 84); the cloud keeps the points inside any of them",

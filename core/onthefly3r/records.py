@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -407,3 +407,9 @@ class CloudTile:
     source: Float  # (N,) int32 shot index of the strongest observation
     batch: Float  # (N,) int32
     views: Float  # (N,) int32 number of images that saw the voxel
+    classification: UInt8 | None = None  # (N,) ASPRS classes: 1 unclassified, 2 ground, 7 noise; None: not classified
+
+    def only(self, kept: Bool) -> CloudTile:
+        """Return the points that are kept, (N,) truth values."""
+        arrays = {item.name: getattr(self, item.name) for item in fields(self)}
+        return replace(self, **{name: values[kept] for name, values in arrays.items() if values is not None})

@@ -47,6 +47,8 @@ PACKAGES = (
     Package("pyproj", "pyproj"),
     Package("laspy", "laspy"),
     Package("pyshp", "shapefile"),
+    Package("rasterio", "rasterio"),
+    Package("jinja2", "jinja2"),
     Package("shapely", "shapely"),
     Package("pillow", "PIL"),
     Package("threadpoolctl", "threadpoolctl"),

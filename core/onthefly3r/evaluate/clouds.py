@@ -40,15 +40,15 @@ class CloudFile:
 
 
 def open_cloud(path: Path) -> CloudFile:
-    """Look at the header of a cloud; `path` may be an output folder of ours, which holds cloud.laz or cloud.las.
+    """Look at the header of a cloud; `path` may be an output folder of ours, which holds one cloud of ours.
 
     Raises:
         ReferenceFormatError: missing, empty, not LAS, LAZ or PLY, or damaged.
     """
     if path.is_dir():
-        found = [path / name for name in ("cloud.laz", "cloud.las") if (path / name).is_file()]
+        found = [path / name for name in ("cloud.laz", "cloud.las", "cloud.copc.laz") if (path / name).is_file()]
         if not found:
-            raise ReferenceFormatError(f"{path}: holds neither cloud.laz nor cloud.las")
+            raise ReferenceFormatError(f"{path}: holds no cloud.laz, cloud.las or cloud.copc.laz")
         path = found[0]
     if not path.is_file():
         raise ReferenceFormatError(f"{path}: no such file")

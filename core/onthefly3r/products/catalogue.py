@@ -12,20 +12,27 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..options import ExportOptions
-from .cloudpass import Sink, cloud_spacing_m
+from .cloudpass import Cloud, Sink
+from .copc import CopcWriter
 from .footprints import write_footprints
 from .las import CloudWriter, las_scale_m
+from .orthophoto import OrthoSummary, write_orthophoto
 from .preview import write_preview
-from .runview import RunView
+from .runview import RunView, raster_tags
 from .sparsepoints import write_colmap
+from .surface import SurfaceSink
 from .trajectory_table import write_trajectory
 from .vector import write_cameras
+
+CLOUD_FILES = ("cloud.laz", "cloud.las", "cloud.copc.laz")
 
 
 @dataclass(frozen=True)
 class Layer:
     """How QGIS loads a product; layers with the greater `height` lie above the others."""
 
+    file: str
+    title: str
     kind: Literal["vector", "raster", "point cloud"]
     height: int
     style: str = ""  # file in resources/styles
@@ -44,8 +51,8 @@ class Product:
     files: tuple[str, ...]  # relative to the output folder: all that it may write
     wanted: Callable[[ExportOptions], bool]
     write: Callable[[Path, RunView, Mapping[str, Any]], Any] | None = None
-    sink: Callable[[Path, RunView], Sink] | None = None
-    layer: Layer | None = None
+    sink: Callable[[Path, RunView, Cloud], Sink] | None = None
+    layers: tuple[Layer, ...] = ()
 
 
 def product(name: str) -> Product:
@@ -61,18 +68,42 @@ def _with_cloud(export: ExportOptions) -> bool:
     return export.cloud
 
 
+def _with_surface(export: ExportOptions) -> bool:
+    return export.cloud and (export.rasters or export.orthophoto != "none")
+
+
+def _with_orthophoto(export: ExportOptions) -> bool:
+    return export.cloud and export.orthophoto != "none"
+
+
 def _shapefile(name: str) -> tuple[str, ...]:
     return tuple(f"{name}.{suffix}" for suffix in ("shp", "shx", "dbf", "prj", "cpg"))
 
 
-def _cloud(out: Path, view: RunView) -> Sink:
-    return CloudWriter(
-        out / f"cloud.{view.options.export.format}",
-        view.frame.wkt,
-        las_scale_m(cloud_spacing_m(view)),
-        view.title,
-        n_images=len(view.shots),
+def _cloud(out: Path, view: RunView, cloud: Cloud) -> Sink:
+    scale_m, wkt, images = las_scale_m(cloud.spacing_m), view.frame.wkt, len(view.shots)
+    if view.options.export.format == "copc":
+        return CopcWriter(
+            out / "cloud.copc.laz", view.work, cloud.extent, cloud.spacing_m, wkt, scale_m, view.title, images
+        )
+    return CloudWriter(out / f"cloud.{view.options.export.format}", wkt, scale_m, view.title, images)
+
+
+def _surface(out: Path, view: RunView, cloud: Cloud) -> Sink:
+    return SurfaceSink(
+        out,
+        view.work,
+        cloud.extent,
+        view.options.export.raster_m or cloud.spacing_m,
+        cloud.terrain,
+        view.crs,
+        view.options.export.fill_holes,
+        raster_tags(view),
     )
+
+
+def _orthophoto(out: Path, view: RunView, made: Mapping[str, Any]) -> OrthoSummary | None:
+    return write_orthophoto(out, view, made["surface"], raster_tags(view))
 
 
 def _cameras(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
@@ -99,16 +130,52 @@ def _preview(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
 
 PRODUCTS: tuple[Product, ...] = (
     Product(
-        "cloud", "Point cloud", ("cloud.laz", "cloud.las"), _with_cloud, sink=_cloud, layer=Layer("point cloud", 20)
+        "cloud",
+        "Point cloud",
+        CLOUD_FILES,
+        _with_cloud,
+        sink=_cloud,
+        layers=tuple(Layer(name, "Point cloud", "point cloud", 30) for name in CLOUD_FILES),
     ),
-    Product("cameras", "Cameras", _shapefile("cameras"), _always, _cameras, layer=Layer("vector", 60, "cameras.qml")),
+    Product(
+        "surface",
+        "Surface and terrain model",
+        ("dsm.tif", "dtm.tif", "confidence.tif"),
+        _with_surface,
+        sink=_surface,
+        layers=(
+            Layer("dsm.tif", "Surface model", "raster", 20, shown=False),
+            Layer("dtm.tif", "Terrain model", "raster", 10, shown=False),
+            Layer("confidence.tif", "Confidence", "raster", 9, shown=False),
+        ),
+    ),
+    Product(
+        "orthophoto",
+        "Orthophoto",
+        ("orthophoto.tif", "overlap.tif", "gsd.tif"),
+        _with_orthophoto,
+        _orthophoto,
+        layers=(
+            Layer("orthophoto.tif", "Orthophoto", "raster", 40),
+            Layer("overlap.tif", "Overlap", "raster", 8, shown=False),
+            Layer("gsd.tif", "Ground sampling distance", "raster", 7, shown=False),
+        ),
+    ),
+    Product(
+        "cameras",
+        "Cameras",
+        _shapefile("cameras"),
+        _always,
+        _cameras,
+        layers=(Layer("cameras.shp", "Cameras", "vector", 80, "cameras.qml"),),
+    ),
     Product(
         "footprints",
         "Footprints",
         _shapefile("footprints"),
         _always,
         _footprints,
-        layer=Layer("vector", 40, "footprints.qml", shown=False),
+        layers=(Layer("footprints.shp", "Footprints", "vector", 60, "footprints.qml", shown=False),),
     ),
     Product("trajectory", "Camera poses as a table", ("trajectory.csv",), _always, _trajectory),
     Product(

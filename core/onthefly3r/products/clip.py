@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.arrays import Float
+from ..geometry.arrays import Bool, Float
 from ..geometry.geodesy import projected_from_geographic
 from ..records import CloudTile, Shot
 
@@ -31,7 +31,7 @@ class Boundary:
 
     area: MultiPolygon | Polygon  # easting, northing, m
 
-    def contains(self, points: Float) -> Float:
+    def contains(self, points: Float) -> Bool:
         """Return which points (N, 2 or more) lie in the area."""
         import shapely
 
@@ -119,7 +119,7 @@ def clipped(tiles: Iterable[CloudTile], boundary: Boundary) -> Iterator[CloudTil
     for tile in tiles:
         inside = boundary.contains(tile.points)
         if inside.any():
-            yield replace(tile, **{item.name: getattr(tile, item.name)[inside] for item in fields(tile)})
+            yield tile.only(inside)
 
 
 def _union(polygons: Sequence[Polygon]) -> Polygon | MultiPolygon:

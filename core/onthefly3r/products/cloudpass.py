@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
@@ -12,10 +13,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..cloud.fuse import fuse
-from ..errors import InputError
+from ..errors import InputError, ReconstructionError
 from ..records import CloudTile, GeoReference
 from .clip import Boundary, clipped, read_boundary
 from .runview import RunView
+from .spool import CloudSpool, Extent
+from .terrain import LowestPoints, Terrain, find_terrain
+
+UNCLASSIFIED, GROUND_CLASS = 1, 2  # ASPRS LAS 1.4 R15, table 17
 
 
 class Sink(Protocol):
@@ -39,6 +44,50 @@ class Sink(Protocol):
     def summary(self) -> Any:
         """What was made, once the sink has ended."""
         ...
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """What is known of the cloud before it is handed out."""
+
+    spacing_m: float  # voxel size
+    points: int
+    left_out: int  # points that lie far outside the survey
+    extent: Extent
+    terrain: Terrain | None  # None where the ground was not asked for, or lengths are not metres
+
+
+@contextmanager
+def gathered(view: RunView) -> Iterator[tuple[Cloud, Iterator[CloudTile]]]:
+    """Fuse the cloud to disk, and yield what is known of it and its tiles, classified and without far strays.
+
+    Raises `ReconstructionError` when the cloud has no points.
+    """
+    spacing_m = cloud_spacing_m(view)
+    with CloudSpool(view.work / "cloud.bin", spacing_m) as spool:
+        lowest = LowestPoints(spacing_m)
+        for tile in cloud_tiles(view):
+            spool.add(tile)
+            lowest.add(tile.points)
+        if not spool.points:
+            raise ReconstructionError(
+                "the cloud has no points; lower min_confidence, or look at the rejected images in the report"
+            )
+        extent = spool.extent()
+        terrain = find_terrain(lowest, extent) if view.options.export.ground and view.frame.metric else None
+        inside = sum(int(extent.contains(tile.points).sum()) for tile in spool.tiles()) if spool.has_strays else None
+        points = spool.points if inside is None else inside
+        yield Cloud(spacing_m, points, spool.points - points, extent, terrain), _handed_out(spool, extent, terrain)
+
+
+def _handed_out(spool: CloudSpool, extent: Extent, terrain: Terrain | None) -> Iterator[CloudTile]:
+    for tile in spool.tiles():
+        if spool.has_strays:
+            tile = tile.only(extent.contains(tile.points))
+        if terrain is not None and len(tile.points):
+            ground = terrain.is_ground(tile.points)
+            tile = replace(tile, classification=np.where(ground, GROUND_CLASS, UNCLASSIFIED).astype(np.uint8))
+        yield tile
 
 
 def cloud_spacing_m(view: RunView) -> float:

@@ -44,13 +44,39 @@ def las_scale_m(spacing_m: float) -> float:
     return float(min(1e-3, 10.0 ** np.floor(np.log10(spacing_m / 10.0) + 1e-9)))
 
 
+class SpacingMeter:
+    """How far apart the points of passing tiles lie, and the window that holds all but the outermost."""
+
+    def __init__(self) -> None:
+        self._spacing, self._counted = 0.0, 0
+        self._sample: list[Float] = []
+
+    def add(self, points: Float) -> None:
+        """Look at the points (N, 3) of a tile."""
+        self._sample.append(points[::WINDOW_STRIDE, :2].copy())
+        spacing = point_spacing(points)
+        if np.isfinite(spacing):
+            self._spacing, self._counted = self._spacing + spacing * len(points), self._counted + len(points)
+
+    @property
+    def spacing_m(self) -> float:
+        """The mean distance of neighbours."""
+        return self._spacing / self._counted if self._counted else float("nan")
+
+    @property
+    def window(self) -> tuple[float, float, float, float]:
+        """min x, min y, max x, max y without the outermost points."""
+        low, high = np.quantile(np.concatenate(self._sample), [WINDOW_TAIL, 1.0 - WINDOW_TAIL], axis=0)
+        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
 class CloudWriter:
     """A LAS or LAZ file that is written tile by tile; a context manager, whose `summary` is there at its end.
 
     Red, green and blue are 16 bit (8 bit x 257). Point source id is the image number from 1 (shot index + 1); with
     more images than it can count, it is 0 and the extra dimension `image` holds the number. Further extra dimensions:
-    `confidence` 0..255, `batch`, `n_views` (also in user data, which QGIS keeps). Every point is return 1 of 1 and
-    class 0.
+    `confidence` 0..255, `batch`, `n_views` (also in user data, which QGIS keeps). Every point is return 1 of 1, and of
+    class 0 where the tiles are not classified.
     """
 
     def __init__(self, path: Path, wkt1: str | None, scale_m: float, description: str = "", n_images: int = 0) -> None:
@@ -60,8 +86,7 @@ class CloudWriter:
         self._files = ExitStack()
         self._writer: Any = None
         self._header: Any = None
-        self._spacing, self._counted = 0.0, 0
-        self._sample: list[Float] = []
+        self._meter = SpacingMeter()
         self.summary: CloudSummary | None = None
 
     def __enter__(self) -> CloudWriter:
@@ -73,16 +98,13 @@ class CloudWriter:
             return
         if self._writer is None:
             self._open(np.round(tile.points.mean(axis=0)))
-        self._writer.write_points(_record(tile, self._header, self._wide))
-        self._sample.append(tile.points[::WINDOW_STRIDE, :2])
-        spacing = point_spacing(tile.points)
-        if np.isfinite(spacing):
-            self._spacing, self._counted = self._spacing + spacing * len(tile.points), self._counted + len(tile.points)
+        self._writer.write_points(las_record(tile, self._header, self._wide))
+        self._meter.add(tile.points)
 
     def _open(self, offset: Float) -> None:
         import laspy
 
-        self._header = _header(offset, self._scale_m, self._wkt, self._description, self._wide)
+        self._header = las_header(offset, self._scale_m, self._wkt, self._description, self._wide)
         temporary = self._files.enter_context(replacing(self._path))
         compress = self._path.suffix.lower() == ".laz"
         self._writer = self._files.enter_context(
@@ -99,14 +121,13 @@ class CloudWriter:
                 "the cloud has no points; lower min_confidence, or look at the rejected images in the report"
             )
         written = self._writer.header
-        low, high = np.quantile(np.concatenate(self._sample), [WINDOW_TAIL, 1.0 - WINDOW_TAIL], axis=0)
         (min_x, min_y, min_z), (max_x, max_y, max_z) = (map(float, ends) for ends in (written.mins, written.maxs))
         self.summary = CloudSummary(
             path=self._path,
             points=int(written.point_count),
             bounds=(min_x, min_y, min_z, max_x, max_y, max_z),
-            window=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
-            mean_spacing_m=self._spacing / self._counted if self._counted else float("nan"),
+            window=self._meter.window,
+            mean_spacing_m=self._meter.spacing_m,
         )
 
 
@@ -138,7 +159,8 @@ def write_cloud(
     return writer.summary
 
 
-def _header(offset: Float, scale_m: float, wkt1: str, description: str, wide: bool) -> Any:
+def las_header(offset: Float, scale_m: float, wkt1: str, description: str, wide: bool) -> Any:
+    """Return a laspy header of our clouds; `wide` keeps image numbers in an extra dimension."""
     import laspy
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
@@ -161,7 +183,8 @@ def _header(offset: Float, scale_m: float, wkt1: str, description: str, wide: bo
     return header
 
 
-def _record(tile: CloudTile, header: Any, wide: bool) -> Any:
+def las_record(tile: CloudTile, header: Any, wide: bool) -> Any:
+    """Return the points of a tile as a record of laspy."""
     import laspy
 
     record = laspy.ScaleAwarePointRecord.zeros(len(tile.points), header=header)
@@ -177,6 +200,8 @@ def _record(tile: CloudTile, header: Any, wide: bool) -> Any:
     views = np.clip(tile.views, 0, 255).astype(np.uint8)
     record.return_number = record.number_of_returns = np.ones(len(tile.points), np.uint8)
     record.user_data = record["n_views"] = views
+    if tile.classification is not None:
+        record.classification = tile.classification
     record["confidence"] = np.rint(np.clip(tile.confidence, 0.0, 1.0) * 255.0).astype(np.uint8)
     record["batch"] = tile.batch.astype(np.uint32)
     image = tile.source.astype(np.int64) + 1

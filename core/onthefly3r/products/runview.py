@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from .. import __version__
+from ..geometry.geodesy import VERTICAL_NAMES
 from ..map.state import MapState
 from ..map.store import Store
 from ..options import Options
@@ -67,3 +69,10 @@ class RunView:
     def footprints(self) -> list[Footprint]:
         """What the placed cameras cover on the ground."""
         return footprints(self.cameras, self.state, self.frame)
+
+
+def raster_tags(view: RunView) -> dict[str, str]:
+    """Return what rasters say of themselves: software, title, and what heights refer to."""
+    tags = {"TIFFTAG_SOFTWARE": f"onthefly3r {__version__}", "TIFFTAG_DOCUMENTNAME": view.title}
+    vertical = view.reference.vertical if view.reference else None
+    return {**tags, "HEIGHTS": VERTICAL_NAMES[vertical] if vertical else "local, not georeferenced"}

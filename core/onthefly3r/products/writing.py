@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .catalogue import PRODUCTS, Product
-from .cloudpass import cloud_tiles
+from .cloudpass import gathered
 from .runview import RunView
 
 
@@ -28,8 +28,10 @@ def _cloud_pass(out: Path, view: RunView, products: list[Product]) -> dict[str, 
     if not products:
         return {}
     with ExitStack() as stack:
-        sinks = {p.name: stack.enter_context(p.sink(out, view)) for p in products if p.sink is not None}
-        for tile in cloud_tiles(view):
+        cloud, tiles = stack.enter_context(gathered(view))
+        sinks = {p.name: stack.enter_context(p.sink(out, view, cloud)) for p in products if p.sink is not None}
+        for done, tile in enumerate(tiles):
+            view.checkpoint("writing the cloud", done, 0)
             for sink in sinks.values():
                 sink.add(tile)
     return {name: sink.summary for name, sink in sinks.items()}
