@@ -117,7 +117,7 @@ def test_cloud_is_read_by_others(case: Case) -> None:
 
 def test_progress_is_told_in_order(case: Case) -> None:
     stages = list(dict.fromkeys(progress.stage for progress in case.told))
-    assert stages[0] == "reading photographs" and stages[-1] == "fusing the cloud"
+    assert stages[0] == "reading photographs" and stages[-1] == "orthophoto"
     assert stages.index("starting the map") < stages.index("refining the cameras") < stages.index("georeferencing")
     assert all(progress.done <= progress.total for progress in case.told)
 

@@ -53,6 +53,7 @@ class Cloud:
     spacing_m: float  # voxel size
     points: int
     left_out: int  # points that lie far outside the survey
+    tiles: int
     extent: Extent
     terrain: Terrain | None  # None where the ground was not asked for, or lengths are not metres
 
@@ -77,7 +78,10 @@ def gathered(view: RunView) -> Iterator[tuple[Cloud, Iterator[CloudTile]]]:
         terrain = find_terrain(lowest, extent) if view.options.export.ground and view.frame.metric else None
         inside = sum(int(extent.contains(tile.points).sum()) for tile in spool.tiles()) if spool.has_strays else None
         points = spool.points if inside is None else inside
-        yield Cloud(spacing_m, points, spool.points - points, extent, terrain), _handed_out(spool, extent, terrain)
+        yield (
+            Cloud(spacing_m, points, spool.points - points, spool.tile_count, extent, terrain),
+            _handed_out(spool, extent, terrain),
+        )
 
 
 def _handed_out(spool: CloudSpool, extent: Extent, terrain: Terrain | None) -> Iterator[CloudTile]:

@@ -81,6 +81,11 @@ class CloudSpool:
         return sum(self._counts)
 
     @property
+    def tile_count(self) -> int:
+        """How many tiles there are."""
+        return len(self._counts)
+
+    @property
     def has_strays(self) -> bool:
         """Whether points lie outside `extent`."""
         extent = self.extent()

@@ -31,7 +31,7 @@ def _cloud_pass(out: Path, view: RunView, products: list[Product]) -> dict[str, 
         cloud, tiles = stack.enter_context(gathered(view))
         sinks = {p.name: stack.enter_context(p.sink(out, view, cloud)) for p in products if p.sink is not None}
         for done, tile in enumerate(tiles):
-            view.checkpoint("writing the cloud", done, 0)
+            view.checkpoint("writing the cloud", done, cloud.tiles)
             for sink in sinks.values():
                 sink.add(tile)
     return {name: sink.summary for name, sink in sinks.items()}

@@ -75,7 +75,7 @@ def write_result(
             raise
         report = _write_report(made, REPORTS, folder, summary)
         earlier = [folder.path / name for name in folder.stamp.files if name in ("cloud.laz", "cloud.las")]
-        stale = [index for cloud in earlier for index in indexes_of(cloud)]
+        stale = [index for cloud in earlier for index in indexes_of(cloud) if not (made / index.path.name).exists()]
         publish(made)
         for index in stale:  # QGIS would show it instead of the new cloud
             index.remove()
