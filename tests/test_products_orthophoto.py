@@ -18,9 +18,9 @@ from onthefly3r.intake.folder import read_photographs
 from onthefly3r.options import IntakeOptions, Options
 from onthefly3r.products.exportframe import ExportFrame
 from onthefly3r.products.footprints import footprint, with_overlap
+from onthefly3r.products.heightmodels import NODATA, SurfaceRasters, SurfaceSink
 from onthefly3r.products.orthophoto import write_orthophoto
 from onthefly3r.products.spool import Extent
-from onthefly3r.products.surface import NODATA, SurfaceRasters, SurfaceSink
 from onthefly3r.products.terrain import LowestPoints, find_terrain
 from onthefly3r.records import CloudTile, GeoReference, PlacedCamera
 from onthefly3r.simulate import Survey, plan_survey

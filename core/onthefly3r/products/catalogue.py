@@ -15,12 +15,13 @@ from ..options import ExportOptions
 from .cloudpass import Cloud, Sink
 from .copc import CopcWriter
 from .footprints import write_footprints
+from .heightmodels import SurfaceSink
 from .las import CloudWriter, las_scale_m
 from .orthophoto import OrthoSummary, write_orthophoto
 from .preview import write_preview
 from .runview import RunView, raster_tags
 from .sparsepoints import write_colmap
-from .surface import SurfaceSink
+from .heightmodels import SurfaceSink
 from .trajectory_table import write_trajectory
 from .vector import write_cameras
 

@@ -17,8 +17,8 @@ from ..intake.images import load_working_image
 from ..records import Shot
 from .cog import CogWriter, Grid
 from .harmonise import ColourSamples, gains, joined, sharpness_lack, spread
+from .heightmodels import NODATA, SurfaceRasters, closed
 from .runview import RunView
-from .surface import NODATA, SurfaceRasters, closed
 from .terrain import interpolated
 from .viewplan import Plan, View, plan_window, views_near
 

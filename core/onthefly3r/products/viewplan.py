@@ -12,7 +12,7 @@ from ..geometry.camera import Camera
 from ..geometry.transforms import Rigid3
 from .cog import Grid
 from .exportframe import ExportFrame
-from .surface import closed
+from .heightmodels import closed
 
 MAX_CANDIDATES = 12  # photographs whose view is tested for what stands in it, per window
 MAX_STEPS = 96  # of a ray on its way to the camera
