@@ -21,7 +21,6 @@ from .orthophoto import OrthoSummary, write_orthophoto
 from .preview import write_preview
 from .runview import RunView, raster_tags
 from .sparsepoints import write_colmap
-from .heightmodels import SurfaceSink
 from .trajectory_table import write_trajectory
 from .vector import write_cameras
 
