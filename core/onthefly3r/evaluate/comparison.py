@@ -11,9 +11,9 @@ from typing import Any, Literal
 from ..errors import InputError
 from ..geometry.transforms import Sim3
 from .clouds import open_cloud
-from .heightmodels import GroundDifference, SurfaceErrors, ground_difference, surface_errors
 from .readers import read_poses, scene_depth
 from .same_frame import in_frame_of
+from .surface import GroundDifference, SurfaceErrors, ground_difference, surface_errors
 from .trajectory_errors import Align, PoseErrors, pose_errors
 
 CloudAlign = Literal["none", "poses"]

@@ -11,7 +11,7 @@ from ..geometry.arrays import Float
 from ..geometry.spacing import point_spacing
 from ..geometry.transforms import Sim3
 from .clouds import CloudFile
-from .heightmodels import sample
+from .surface import sample
 
 SYSTEM_LIBRARIES = "apt-get install libegl1 libgl1 libx11-6 libusb-1.0-0 libudev1 libidn2-0"
 MAX_POINTS = 200_000
