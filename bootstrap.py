@@ -32,7 +32,8 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent
-STAMP_NAME = "onthefly3r-stamp.json"
+STAMP_NAME = "onthefly3r-stamp.json"  # in an environment that is complete
+MARK_NAME = "onthefly3r-environment.txt"  # in one that we made, complete or not
 OLDEST_PYTHON = (3, 10)
 QGIS_PYTHON = "ONTHEFLY3R_QGIS_PYTHON"  # variable that names an interpreter with QGIS, for the tests
 QGIS_PACKAGES = ("qgis", "python3-qgis", "qgis-providers", "python3-pytest", "xvfb")
@@ -109,8 +110,8 @@ def create_environment(
     """Make the environment in `folder`, install the package of `source` with `extras`, return its interpreter.
 
     Returns at once when a stamp in the folder says that this was done already; extras add up. `constraints` are
-    lines of a pip constraints file; `alone` are requirements that come without what they depend on. Raises
-    `SetupError` with the remedy.
+    lines of a pip constraints file; `alone` are requirements that come without what they depend on. A folder that
+    holds anything else than an environment of ours is left alone. Raises `SetupError` with the remedy.
     """
     folder = Path(folder).absolute()
     python = environment_python(folder)
@@ -124,6 +125,7 @@ def create_environment(
             return python
         wanted, lone = wanted | set(installed["extras"]), lone | lone_there
     else:
+        _claim(folder, bool(installed))
         _make_venv(folder, progress)
     _check_room(folder, wanted)
     (folder / STAMP_NAME).unlink(missing_ok=True)
@@ -179,6 +181,27 @@ def _package_hash(source: Path) -> str:
     return hashlib.sha256((source / "pyproject.toml").read_bytes() + str(source).encode()).hexdigest()
 
 
+def _claim(folder: Path, stamped: bool) -> None:
+    """Empty a folder that is ours for a new environment; raises `SetupError` for one that holds anything else."""
+    mark = folder / MARK_NAME
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise SetupError(f"{folder} is a file or a link: name a folder that is empty or not there yet.")
+    if folder.is_dir() and any(folder.iterdir()) and not (stamped or mark.is_file()):
+        raise SetupError(
+            f"{folder} is not empty, and no environment that this program made: nothing in it was changed. "
+            f"Name an empty folder, for instance {folder / 'onthefly3r'}, or delete this one yourself."
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    mark.write_text("An environment of On-the-Fly3R: 'bootstrap.py setup' replaces all that is here.\n", "utf-8")
+    for item in folder.iterdir():
+        if item == mark:
+            continue
+        if item.is_dir() and not item.is_symlink():
+            shutil.rmtree(item)
+        else:
+            item.unlink()
+
+
 def _make_venv(folder: Path, progress: Report) -> None:
     if importlib.util.find_spec("venv") is None or importlib.util.find_spec("ensurepip") is None:
         version = f"{sys.version_info.major}.{sys.version_info.minor}"
@@ -189,7 +212,7 @@ def _make_venv(folder: Path, progress: Report) -> None:
         )
     progress(f"Making the environment {folder}")
     made = subprocess.run(
-        [sys.executable, "-m", "venv", "--clear", str(folder)],
+        [sys.executable, "-m", "venv", str(folder)],
         capture_output=True,
         text=True,
         errors="replace",

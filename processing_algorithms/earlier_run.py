@@ -38,7 +38,7 @@ class EarlierRunAlgorithm(CoreAlgorithm):
     def run_folder(self, parameters: dict[str, Any], context: QgsProcessingContext) -> Path:
         """Return the folder; raises `QgsProcessingException` when it holds no run."""
         run = require_folder(self.parameterAsString(parameters, RUN, context), tr("Folder of a run"))
-        if not (run / "report.json").is_file():
+        if not (run / "report.json").is_file() and not (run / "work" / "run.json").is_file():
             raise QgsProcessingException(
                 tr("{} holds no report.json: name the output folder of 'Reconstruct photographs'.").format(run)
             )

@@ -16,11 +16,12 @@ from qgis.core import (
     QgsProcessingParameterFileDestination,
 )
 
+from ..core.onthefly3r.files.las_index import indexes_beside, indexes_of
 from .base import tr
 from .boundary import add_boundary, boundary_file
 from .earlier_run import EarlierRunAlgorithm, scratch_folder
 from .parameters import add, add_options, add_target_crs, options_from
-from .presentation import remove_stale_index, show
+from .presentation import show
 
 OUTPUT = "OUTPUT"
 FORMATS = ("laz", "las")
@@ -84,11 +85,17 @@ class ExportCloud(EarlierRunAlgorithm):
             report = json.loads((scratch / "report.json").read_text(encoding="utf-8"))
             if report["georeference"] is None:
                 feedback.pushWarning(tr("The run is not georeferenced: the cloud is in map units."))
-            remove_stale_index(out)
+            stale = indexes_of(out)
             try:
                 (scratch / f"cloud.{_format(str(out))}").replace(out)
             except OSError as error:
                 raise QgsProcessingException(tr("{} cannot be written ({}).").format(out, error.strerror)) from error
+            for index in stale:  # of the cloud that was replaced: QGIS would show it instead of the new one
+                index.remove()
+            for foreign in indexes_beside(out):
+                feedback.pushWarning(
+                    tr("{} is not of this cloud: QGIS may show it instead; move it away.").format(foreign.path)
+                )
         show(context, str(out), run.name, "cloud")
         cloud, geo = report["cloud"], report["georeference"] or {}
         return {

@@ -15,7 +15,6 @@ from qgis.core import (
 from .base import tr
 from .earlier_run import EarlierRunAlgorithm
 from .parameters import add, add_georeference, add_options, options_from
-from .presentation import remove_stale_index
 from .results import add_run_outputs, hand_over
 
 OUTPUT = "OUTPUT"
@@ -57,7 +56,6 @@ class Georeference(EarlierRunAlgorithm):
     ) -> dict[str, Any]:
         """Write everything again, then fill the layers."""
         out = Path(self.parameterAsString(parameters, OUTPUT, context))
-        remove_stale_index(out / "cloud.laz")
         options = options_from(self, parameters, context, every=True)
         self.export(self.run_folder(parameters, context), out, options, feedback)
         return {OUTPUT: str(out), **hand_over(self, parameters, context, feedback, out)}

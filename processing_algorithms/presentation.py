@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-from pathlib import Path
 from typing import Any, ClassVar
 
 from qgis.core import (
@@ -101,12 +99,3 @@ def load_cloud(context: QgsProcessingContext, feedback: QgsProcessingFeedback, p
     details.forceName = True
     _present(details, group, "cloud")
     context.addLayerToLoadOnCompletion(path, details)
-
-
-def remove_stale_index(cloud: Path) -> None:
-    """Remove what QGIS made beside an earlier cloud: it would be shown instead of the new one."""
-    for stale in (cloud.with_name(f"{cloud.stem}.copc.laz"), cloud.with_name(f"ept_{cloud.stem}")):
-        if stale.is_file():
-            stale.unlink()
-        elif stale.is_dir():
-            shutil.rmtree(stale, ignore_errors=True)

@@ -24,7 +24,6 @@ from .parameters import (
     options_from,
     require_folder,
 )
-from .presentation import remove_stale_index
 from .results import add_run_outputs, hand_over
 
 PHOTOS, OUTPUT = "PHOTOS", "OUTPUT"
@@ -82,7 +81,6 @@ class ReconstructPhotographs(CoreAlgorithm):
         photos = require_folder(self.parameterAsString(parameters, PHOTOS, context), tr("Folder of photographs"))
         run = Path(self.parameterAsString(parameters, OUTPUT, context))
         options = options_from(self, parameters, context)
-        remove_stale_index(run / "cloud.laz")
         with boundary_file(self, parameters, context) as boundary:
             self.run_core(Job("run", (str(photos), str(run)), {**options, "boundary": boundary}), feedback)
         return {OUTPUT: str(run), **hand_over(self, parameters, context, feedback, run)}

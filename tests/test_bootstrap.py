@@ -365,3 +365,22 @@ def test_script_needs_only_the_standard_library() -> None:
         check=True,
     )
     assert set(ran.stdout.split()) - set(sys.stdlib_module_names) == {"bootstrap"}
+
+
+@pytest.mark.parametrize("name", ["thesis.txt", "pyvenv.cfg"])
+def test_folder_of_somebody_else_is_no_place_for_an_environment(
+    name: str, bootstrap: ModuleType, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text("precious", encoding="utf-8")
+    with pytest.raises(bootstrap.SetupError, match="is not empty"):
+        bootstrap.create_environment(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_environment_that_was_cut_short_is_made_anew(bootstrap: ModuleType, tmp_path: Path) -> None:
+    """Nothing but the mark says that it is ours until it is complete."""
+    bootstrap._claim(tmp_path, stamped=False)
+    (tmp_path / "lib").mkdir()
+    (tmp_path / "lib" / "half.py").touch()
+    bootstrap._claim(tmp_path, stamped=False)
+    assert [path.name for path in tmp_path.iterdir()] == [bootstrap.MARK_NAME]

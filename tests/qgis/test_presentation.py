@@ -124,15 +124,6 @@ def test_newer_qgis_groups_and_orders_itself(plugin: Any) -> None:
     assert all(details.kept is not None for details in context.details.values())
 
 
-def test_stale_index_is_removed(plugin: Any, tmp_path: Path) -> None:
-    (tmp_path / "cloud.copc.laz").write_text("")
-    (tmp_path / "ept_cloud").mkdir()
-    (tmp_path / "ept_cloud" / "ept.json").write_text("")
-    (tmp_path / "cloud.laz").write_text("")
-    plugin("processing_algorithms.presentation").remove_stale_index(tmp_path / "cloud.laz")
-    assert [path.name for path in tmp_path.iterdir()] == ["cloud.laz"]
-
-
 def test_menu_opens_and_goes_away(qgis: Any, plugin: Any, run: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     from qgis.core import QgsApplication
     from qgis.PyQt.QtGui import QGuiApplication

@@ -72,7 +72,7 @@ def run(
         result = reconstruct(photos, out, options, here.progress, here.cancelled)
         for warning in result.report.get("warnings", ()):
             here.warning(warning)
-        here.reporter.result(_result_data(result), columns(_result_summary(result)))
+        here.result(_result_data(result), columns(_result_summary(result)))
 
 
 @app.command()
@@ -101,7 +101,7 @@ def batch(
             read_flights(flights, leave_out=out), out, options, skip_done, here.progress, here.cancelled
         )
         data = {"table": str(out / "flights.csv"), "flights": [asdict(row) for row in rows]}
-        here.reporter.result(data, columns({row.flight: f"{row.status} {row.message}".strip() for row in rows}))
+        here.result(data, columns({row.flight: f"{row.status} {row.message}".strip() for row in rows}))
         failed = [row.flight for row in rows if row.status == "failed"]
         if failed:
             raise ReconstructionError(f"{len(failed)} of {len(rows)} flights failed: {', '.join(failed)}")
@@ -136,7 +136,7 @@ def check(
         for warning in summary["warnings"]:
             here.warning(warning)
         data = {"check": str(write_check(out, checked)), **summary}
-        here.reporter.result(data, columns({name: str(value) for name, value in data.items() if name != "warnings"}))
+        here.result(data, columns({name: str(value) for name, value in data.items() if name != "warnings"}))
 
 
 @app.command()
@@ -155,7 +155,7 @@ def export(
 
         options = run_options(over_earlier(earlier_options(result), given(values)))
         again = export_run(result, out, options, here.progress)
-        here.reporter.result(_result_data(again), columns(_result_summary(again)))
+        here.result(_result_data(again), columns(_result_summary(again)))
 
 
 @app.command()
@@ -207,7 +207,7 @@ def evaluate(
             icp=icp,
             ground_cell_m=ground_cell_m,
         )
-        here.reporter.result(report.to_dict(), format_table(report))
+        here.result(report.to_dict(), format_table(report))
 
 
 @app.command()
@@ -220,7 +220,7 @@ def simulate(out: Out, json: JsonLines = False, **values: Any) -> None:
 
         survey = simulate_survey(out, options, here.progress)
         data = {"photos": str(out / "photos"), "truth": str(out / "truth"), "given": len(survey.views)}
-        here.reporter.result(data, columns({name: str(value) for name, value in data.items()}))
+        here.result(data, columns({name: str(value) for name, value in data.items()}))
 
 
 @app.command()
@@ -233,7 +233,7 @@ def demo(
         from .demo import run_demo
 
         shown = run_demo(out, here.progress, here.cancelled)
-        here.reporter.result(
+        here.result(
             {**_result_data(shown.result), "accuracy": asdict(shown.accuracy)},
             columns({**_result_summary(shown.result), **_demo_summary(shown)}),
         )

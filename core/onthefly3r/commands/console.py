@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import signal
@@ -10,7 +11,7 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, TextIO
@@ -25,14 +26,22 @@ from ..files.atomic import write_text
 from ..files.ownership import CRASH_NOTE, WORK, holds_map
 from ..files.room import is_storage_trouble, storage_error
 
-STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name)]
+STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)]
+
+
+class _PlainConsole(Console):
+    """A console that goes quiet when nobody reads it any more; rich's own ends the process."""
+
+    def on_broken_pipe(self) -> None:
+        """Stop writing."""
+        self.quiet = True
 
 
 class HumanReporter:
     """A progress bar on standard error and the result as text on standard output."""
 
     def __init__(self) -> None:
-        self.errors = Console(stderr=True, highlight=False)
+        self.errors = _PlainConsole(stderr=True, highlight=False)
         self._stage = ""
         self._bar = Progress(
             TextColumn("{task.description}"),
@@ -83,7 +92,7 @@ class HumanReporter:
     def result(self, data: dict[str, Any], text: str) -> None:
         """Print the result; lines are not broken, so that a path stays whole."""
         self._bar.stop()
-        print(text)
+        print(text, flush=True)
 
 
 class JsonReporter:
@@ -137,6 +146,7 @@ class Session:
         self.stop_asked = False
         self._polite = polite
         self._warned: set[str] = set()
+        self.lost: OSError | None = None  # why output cannot be written any more
 
     def cancelled(self) -> bool:
         """Return whether Ctrl-C or a termination signal arrived."""
@@ -148,13 +158,14 @@ class Session:
         self.listen_to_signals()
         if self.stop_asked:
             raise Cancelled("stopped on request")
-        self.reporter.progress(report)
+        self._write(lambda: self.reporter.progress(report))
 
     def listen_to_signals(self) -> None:
         """Let Ctrl-C and termination signals ask this session to stop; does nothing outside the main thread."""
         if threading.current_thread() is threading.main_thread():
             for number in STOP_SIGNALS:
-                signal.signal(number, self._stop)
+                if signal.getsignal(number) is not signal.SIG_IGN:  # as `nohup` wants it
+                    signal.signal(number, self._stop)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         if self.stop_asked or not self._polite:
@@ -165,7 +176,28 @@ class Session:
         """Tell a warning once."""
         if message not in self._warned:
             self._warned.add(message)
-            self.reporter.warning(message)
+            self._write(lambda: self.reporter.warning(message))
+
+    def result(self, data: dict[str, Any], text: str) -> None:
+        """Tell the result."""
+        self._write(lambda: self.reporter.result(data, text))
+
+    def _write(self, tell: Callable[[], None]) -> None:
+        """Tell something; where the output is full or gone, work on: the files are worth more than the words.
+
+        Raises `Cancelled` when the program that reads the JSON lines is gone: nobody waits for the result.
+        """
+        if self.lost is not None:
+            return
+        try:
+            tell()
+        except OSError as error:
+            self.lost = error
+            _silence_output()
+            if isinstance(self.reporter, JsonReporter) and isinstance(error, BrokenPipeError):
+                raise Cancelled(
+                    "stopped: the program that started this one does not read its output any more"
+                ) from error
 
 
 @contextlib.contextmanager
@@ -180,12 +212,29 @@ def session(*, json_lines: bool, out: Path | None = None, polite: bool = True) -
         with _signals(here), _warnings_to(here):
             try:
                 yield here
-                return
+                if here.lost is None or here.lost.errno != errno.ENOSPC:
+                    return
+                message = "the work is done, but its output could not be written: no room left on the disk"
+                exit_code = StorageError.exit_code
             except BaseException as error:
                 message, exit_code = _explain(error, out)
-        with contextlib.suppress(BrokenPipeError):
+        with contextlib.suppress(OSError):
             reporter.error(message, exit_code)
     raise typer.Exit(exit_code)
+
+
+def _silence_output() -> None:
+    """Send what is left in the buffers of a lost output nowhere, so that the interpreter does not complain of it."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.__stdout__, sys.__stderr__):
+            if stream is None:
+                continue
+            try:
+                stream.flush()
+            except OSError:
+                os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
 
 
 def _explain(error: BaseException, out: Path | None) -> tuple[str, int]:

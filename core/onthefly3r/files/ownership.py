@@ -19,6 +19,7 @@ from .atomic import write_text
 STAMP_NAME = "onthefly3r.json"
 WORK = "work"
 MAP = "map"  # group of the files in `work` that hold the map of a run
+SURVEY = "survey"  # group of the photographs and the truth of a simulation
 CRASH_NOTE = "crash.txt"  # among them
 FORMAT = 1
 MAX_STAMP_BYTES = 64 * 2**20
@@ -98,6 +99,22 @@ def holds_map(folder: Path) -> bool:
         return stamp is not None and stamp.has_map and not (folder / WORK).is_symlink()
     except (InputError, OSError):
         return False
+
+
+def products_in(folder: Path) -> set[Path]:
+    """Return what a run of ours wrote into a folder, and its work folder; photographs of a simulated survey are none.
+
+    Results of releases without a stamp are known by the record of their run.
+    """
+    record = folder / WORK / "run.json"
+    old = {folder / WORK, folder / "preview.png"} if record.is_file() else set()
+    try:
+        stamp = read_stamp(folder)
+    except (InputError, OSError):
+        return old
+    if stamp is None:
+        return old
+    return old | {folder / name for name, item in stamp.files.items() if item.group != SURVEY}
 
 
 def fingerprint(path: Path) -> str:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import InputError, PhotographError
+from ..files.ownership import products_in
 from ..files.regular import open_regular
 from ..options import IntakeOptions
 from ..records import RefusedPhotograph, Shot
@@ -66,16 +67,29 @@ def find_photographs(folder: Path, recursive: bool, leave_out: Path | None = Non
 
 
 def files_in(folder: Path, recursive: bool, suffixes: Collection[str], leave_out: Path | None = None) -> list[Path]:
-    """Return the files with one of these suffixes (lower case, with the dot), sorted by name, hidden ones left out."""
+    """Return the files with one of these suffixes (lower case, with the dot), sorted by name, hidden ones left out.
+
+    What a run of ours wrote into a folder among them, such as its preview, is left out too.
+    """
     found: list[Path] = []
+    products: set[Path] = set()
     results = None if leave_out is None else leave_out.resolve()
     for parent, folders, names in os.walk(folder):
-        inner = sorted(name for name in folders if not name.startswith(".") and Path(parent, name).resolve() != results)
+        products |= products_in(Path(parent))
+        inner = sorted(
+            name
+            for name in folders
+            if not name.startswith(".")
+            and Path(parent, name) not in products
+            and Path(parent, name).resolve() != results
+        )
         folders[:] = inner if recursive else []
         found += [
             Path(parent, name)
             for name in names
-            if not name.startswith(".") and os.path.splitext(name)[1].lower() in suffixes  # noqa: PTH122
+            if not name.startswith(".")
+            and Path(parent, name) not in products
+            and os.path.splitext(name)[1].lower() in suffixes  # noqa: PTH122
         ]
     return sorted(found, key=lambda path: path.relative_to(folder).as_posix())
 

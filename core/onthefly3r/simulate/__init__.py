@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from ..files.owned import OwnedFolder
+from ..files.ownership import SURVEY
 from ..protocol import Progress, ProgressCallback
 from .flight import Survey, SurveyOptions, TrueView, plan_survey
 from .photographs import render, write_photograph
@@ -25,7 +26,7 @@ def simulate_survey(out: Path, options: SurveyOptions, progress: ProgressCallbac
     survey = plan_survey(options)
     with OwnedFolder.claim(Path(out), "simulate") as folder, folder.scratch() as made:
         _render(made, survey, progress)
-        folder.publish(made, "survey")
+        folder.publish(made, SURVEY)
     return survey
 
 
