@@ -26,6 +26,7 @@ from .positions import Positions, usable_positions
 from .updirection import UpWitness
 
 FAR_KM = 20.0
+LOOKS_UP = 0.3  # upward part of the mean view
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,7 @@ def control_start(
             if start is None:
                 raise
         else:
+            _require_upright(control, similarity, poses)
             off = np.linalg.norm(enu[high] - similarity.apply(map_points[high]), axis=1)
             bad = [labels[k] for k in np.flatnonzero(high)[~good]]
             told += [
@@ -143,6 +145,16 @@ def control_enu(control: Control, labels: Sequence[str], frame: EnuFrame, vertic
     sigma = np.array([(p.sigma_h_m, p.sigma_h_m, p.sigma_v_m) for p in points]).reshape(-1, 3)
     sigma[np.isnan(height), 2] = np.inf
     return enu, sigma
+
+
+def _require_upright(control: Control, enu_from_map: Sim3, poses: Sequence[Rigid3]) -> None:
+    """Raise where cameras would look up from below the ground: over flat ground, that is what a mirror image fits."""
+    view = enu_from_map.rotation @ np.mean([pose.rotation[:, 2] for pose in poses], axis=0)
+    if view[2] > LOOKS_UP:
+        raise GeoreferenceError(
+            f"{control.path} fits only with the cameras below the ground, which is a mirror image: its x and y are "
+            "exchanged; exchange the columns"
+        )
 
 
 def _require_near(control: Control, enu: Float, start: BlockStart, map_points: Float) -> None:

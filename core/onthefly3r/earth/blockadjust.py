@@ -62,7 +62,10 @@ def adjust_block(
     block = block_of(state, observed, shots)
     solved = None if block is None else calibrated(block, options.backbone.principal_point)
     if block is None or solved is None:
-        return None
+        if control is None:
+            return None
+        why = "control: is left out, because the local models brought no tracks to adjust it with"
+        return Adjusted(Refinement({}, {}, {}), None, (why,))
     joint = options.georeference.gps == "adjust"
     start, warnings = positions_start(block, solved, shots, options, ground_normal(state))
     points = None

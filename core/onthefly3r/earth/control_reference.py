@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..errors import OptionError
+from ..errors import GeoreferenceError, OptionError
 from ..geometry.arrays import Float
 from ..geometry.geodesy import VERTICAL_NAMES, EnuFrame, projected_crs
 from ..geometry.transforms import Rigid3
@@ -29,7 +29,14 @@ def earth_reference(
     Raises what `georeference` raises.
     """
     if tie is None:
-        return georeference(map_from_cam, shots, options, ground_normal)
+        try:
+            return georeference(map_from_cam, shots, options, ground_normal)
+        except GeoreferenceError as error:
+            if options.control is None:
+                raise
+            raise GeoreferenceError(
+                f"the ground control does not tie the map to the Earth (the report's warnings say why), and {error}"
+            ) from error
     if not tie.by_control:
         fitted = georeference(map_from_cam, shots, options, ground_normal)
         return replace(fitted, deviations=tie.deviations, control=tie.control)
