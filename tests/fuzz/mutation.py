@@ -6,7 +6,7 @@ import random
 import re
 from collections.abc import Sequence
 
-MOST_CHANGES = 6
+MOST_CHANGES = 4
 MOST_BYTES = 1 << 20
 BYTES = (0, 1, 0x7F, 0x80, 0xFE, 0xFF)
 WORDS = (0, 1, 2, 0x7FFF, 0x8000, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
