@@ -28,7 +28,7 @@ from onthefly3r.protocol import Event, Progress
 ROOT = Path(__file__).resolve().parents[1]
 REPORT = {
     "georeference": {"crs": "EPSG:32633", "vertical": "egm96", "n_used": 9, "rmse_h_m": 0.4, "rmse_v_m": 0.6},
-    "cloud": {"points": 1234567, "mean_spacing_m": 0.052},
+    "cloud": {"points": 1234567, "mean_spacing": 0.052, "unit": "m"},
     "timing": {"total_s": 61.0, "per_image_s": 6.1},
 }
 

@@ -68,7 +68,14 @@ def test_keys_and_values() -> None:
         "rmse_v_m": None,
         "method": "ransac+irls",
     }
-    assert report["cloud"] == {"path": "cloud.laz", "points": 12, "bounds": [0, 1, 2, 3, 4, 5], "mean_spacing_m": 0.05}
+    assert report["cloud"] == {
+        "path": "cloud.laz",
+        "points": 12,
+        "bounds": [0, 1, 2, 3, 4, 5],
+        "mean_spacing_m": 0.05,
+        "mean_spacing": 0.05,
+        "unit": "m",
+    }
     assert report["timing"] == {
         "total_s": 10.0,
         "per_image_s": 0.5,

@@ -342,7 +342,7 @@ def _result_summary(result: Result) -> dict[str, str]:
             rmse = f"{georeference['rmse_h_m']:.2f} m horizontally, {georeference['rmse_v_m']:.2f} m vertically"
             summary["positions"] = f"{georeference['n_used']} used, residuals {rmse} (RMS, not the accuracy)"
     if cloud:
-        summary["points"] = f"{cloud['points']:,}, {cloud['mean_spacing_m']:.3f} m apart"
+        summary["points"] = f"{cloud['points']:,}, {cloud['mean_spacing']:.3f} {cloud['unit']} apart"
     if timing:
         summary["time"] = f"{timing['total_s']:.0f} s, {timing['per_image_s']:.2f} s per photograph"
     for name, path in (("cloud", result.cloud), ("cameras", result.cameras), ("report", result.report_path)):

@@ -155,7 +155,9 @@ class Engine(Workbench):
                 fix = self.shots[index].gps
                 self._origin = self._origin or fix
                 position = plane_position(fix, self._origin) if fix and self._origin else None
-                self.index.add(index, self._describer.describe(index, self.images[index]), position)
+                image = self.images[index]
+                self.index.add(index, self._describer.describe(index, image), position)
+                self.near_copies.add(index, image.rgb)
         self.frontier.add(self._pending, self.index)
         self.waiting += self._pending
         self._pending = []

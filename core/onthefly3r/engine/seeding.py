@@ -40,7 +40,8 @@ class Seeds:
                 return False  # more images make more attempts worth while
             # Attempts after the first few are smaller: a small group may hang together where a large one does not.
             wanted = size if len(self.refused) < SEED_ATTEMPTS else max(5, size // 3)
-            seed = choose_seed(bench.waiting, bench.index.similarities, wanted, frozenset(self.refused))
+            refused = frozenset(self.refused)
+            seed = choose_seed(bench.waiting, bench.index.similarities, wanted, refused, bench.near_copies)
             if self.refused and bench.options.registration.fragments:  # the photographs may be of several places
                 seed = hanging_together(seed, bench.waiting, bench.index.similarities)
             if len(seed) < 3 or len(self.refused) > 3 * SEED_ATTEMPTS:
@@ -69,7 +70,8 @@ class Seeds:
             group = bench.frontier.hanging_together(candidates, bench.index)
             if len(group) < least:
                 return False
-            seed = choose_seed(group, bench.index.similarities, FRAGMENT_SEED, frozenset(self.refused_fragments))
+            tried = frozenset(self.refused_fragments)
+            seed = choose_seed(group, bench.index.similarities, FRAGMENT_SEED, tried, bench.near_copies)
             seed = tuple(bench.frontier.hanging_together(seed, bench.index, first=seed[:1]))
             if len(seed) < min(least, FRAGMENT_SEED) or bench.frontier.prefers(seed, bench.state.frames, bench.index):
                 return False

@@ -17,6 +17,7 @@ from ..options import Options
 from ..records import LocalModel, Rejection, Shot, Submap, Subset, WorkingImage
 from ..selection.frontier import Frontier
 from ..selection.index import RetrievalIndex
+from ..selection.nearcopies import NearCopies
 from ..selection.retry import RetryQueue
 from ..stopwatch import Stopwatch
 
@@ -44,6 +45,7 @@ class Workbench:
         self.backbone = backbone
         self.images = ImageCache(self.shots, load, work / "features")  # beside what else can be made again
         self.index = RetrievalIndex()
+        self.near_copies = NearCopies()
         self.frontier = Frontier()
         self.retry = RetryQueue(options.registration.max_retries if options.registration.validation else 0)
         self.waiting: list[int] = []  # described, in the order in which they are to be tried

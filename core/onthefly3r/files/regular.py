@@ -18,16 +18,17 @@ class BoundedReader(io.BufferedReader):
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Read as `io.BufferedReader` does; raises `OSError` (EFBIG) beyond the limit."""
-        if size is None or size < 0:
-            size = self._left + 1
-        if size > self._left:
-            found = super().read(self._left + 1)
-            if len(found) > self._left:
-                raise OSError(errno.EFBIG, "more is read from this file than a sound one needs")
-        else:
-            found = super().read(size)
+        rest = max(0, os.fstat(self.fileno()).st_size - self.tell())
+        wanted = rest if size is None or size < 0 else min(size, rest)
+        if wanted > self._left:  # before a byte of it is read: a hole of gigabytes costs nothing on the disk
+            raise OSError(errno.EFBIG, "more is read from this file than a sound one needs")
+        found = super().read(size)
         self._left -= len(found)
         return found
+
+    def allow(self, limit: int) -> None:
+        """Let so many more bytes be read from now on."""
+        self._left = limit
 
 
 def open_regular(path: Path, limit: int = 1 << 62) -> BoundedReader:

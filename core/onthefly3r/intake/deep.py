@@ -65,7 +65,7 @@ def with_common_range(shots: Sequence[Shot], known: Sequence[Shot] = ()) -> list
 
 def _sample_of(shot: Shot) -> Float | None:
     try:
-        with quiet(), opened(shot.path, shot.name) as image:
+        with quiet(), opened(shot.path, shot.name, pixels=True) as image:
             require_memory(image, shot.name)
             return _sample(_values(image))
     except PhotographError:

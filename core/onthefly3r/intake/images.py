@@ -97,7 +97,7 @@ def _unchanged(shot: Shot, patience: Patience) -> Shot:
 
 
 def _decoded(shot: Shot, working_px: int) -> WorkingImage:
-    with quiet(), opened(shot.path, shot.name) as image:
+    with quiet(), opened(shot.path, shot.name, pixels=True) as image:
         try:
             reduced = _reduce(image, shot, working_px)
         except (MemoryError, PhotographError):

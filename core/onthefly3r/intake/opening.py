@@ -18,20 +18,23 @@ if TYPE_CHECKING:
 FORMATS = ("JPEG", "PNG", "TIFF")  # the JPEG reader also takes MPO, a JPEG with further pictures appended
 MAX_PIXELS = 400_000_000
 MAX_DECODED_BYTES = 768 << 20  # of one photograph while it is decoded
-MAX_READ_BYTES = 1 << 30  # of its file: a forged directory may point to gigabytes of holes
+MAX_TAG_BYTES = 64 << 20  # read from a file before its pixels: a forged directory may point to gigabytes of holes
+MAX_FILE_BYTES = 1 << 30  # read for its pixels
 READABLE_MODES = frozenset({"1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "I;16", "I;16B", "I"})
 _BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2, "I;16B": 2}  # a pixel in Pillow's memory; all others take 4
 
 
 @contextmanager
-def opened(path: Path, name: str) -> Iterator[Image]:
-    """Yield the Pillow image of a file without decoding it.
+def opened(path: Path, name: str, pixels: bool = False) -> Iterator[Image]:
+    """Yield the Pillow image of a file without decoding it; `pixels` lets it be decoded afterwards.
 
     Raises `PhotographError` for files that are empty, no photograph that can be read here (with what to do about it),
     larger than 400 Mpx or of a pixel type that is no photograph; `OSError` where the file cannot be opened.
     """
-    with open_regular(path, MAX_READ_BYTES) as stream:
+    with open_regular(path, MAX_TAG_BYTES) as stream:
         kind = _checked_kind(stream, name)
+        if kind in ("heic", "dng"):  # their readers take the whole file
+            stream.allow(MAX_FILE_BYTES)
         try:
             image = _open(stream, kind)
         except (MemoryError, PhotographError):
@@ -46,6 +49,8 @@ def opened(path: Path, name: str) -> Iterator[Image]:
                 raise PhotographError(name, f"{width} x {height} px: there are no pixels")
             if image.mode not in READABLE_MODES:
                 raise PhotographError(name, f"pixel type {image.mode} is not supported; convert it to 8-bit RGB")
+            if pixels:
+                stream.allow(MAX_FILE_BYTES)
             yield image
 
 

@@ -49,6 +49,7 @@ def page(report: Mapping[str, Any], title: str, preview: bool) -> str:
     ]
     if report["error"]:
         parts.append(f'<p class="bad">{escape(report["error"])}</p>')
+    parts += [f'<p class="bad">{escape(text)}</p>' for text in report["attention"]]
     parts.append(_table(_summary(report)))
     if preview and not report["error"]:
         parts.append('<p><img src="preview.png" alt="The cloud from above with the cameras"></p>')
@@ -73,7 +74,7 @@ def _summary(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         rows.append(("Coordinates", "local, without a coordinate reference system"))
     if cloud:
         rows.append(("Points", f"{cloud['points']:,}"))
-        rows.append(("Mean distance of points", f"{_number(cloud['mean_spacing_m'], 3)} m"))
+        rows.append(("Mean distance of points", f"{_number(cloud['mean_spacing'], 3)} {cloud['unit']}"))
     return rows
 
 

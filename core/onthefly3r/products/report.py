@@ -52,6 +52,7 @@ class RunSummary:
     warnings: Sequence[str] = ()
     details: Mapping[str, Any] = field(default_factory=dict)  # further figures, JSON values
     backbone_facts: Mapping[str, Any] = field(default_factory=dict)  # name, version, licence, weights
+    unit: str = "m"  # of the cloud's coordinates: a local frame without scale has map units
     stage_memory: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # peaks by stage, MiB
 
 
@@ -105,7 +106,9 @@ def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
             "path": cloud.path.name,
             "points": cloud.points,
             "bounds": list(cloud.bounds),
-            "mean_spacing_m": cloud.mean_spacing_m,
+            "mean_spacing_m": cloud.mean_spacing_m if run.unit == "m" else None,
+            "mean_spacing": cloud.mean_spacing_m,
+            "unit": run.unit,
         },
         "timing": {
             "total_s": timing.total_s,
@@ -116,6 +119,7 @@ def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
         },
         "memory": {"peak_rss_mib": peak_rss_mib, "stages": dict(run.stage_memory)},
         "error": run.error,
+        "attention": attention(run.placed, run.given, geo),
         "warnings": [*attention(run.placed, run.given, geo), *run.warnings, *(geo.warnings if geo else ())],
         "details": dict(run.details),
     }

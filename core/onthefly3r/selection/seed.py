@@ -17,6 +17,7 @@ def choose_seed(
     similarities: Callable[[Sequence[int], Sequence[int]], Float],
     size: int,
     avoid: frozenset[int],
+    is_copy: Callable[[int, int], bool] | None = None,
 ) -> tuple[int, ...]:
     """Return up to `size` candidates that are mutually similar, in the order in which they joined.
 
@@ -29,6 +30,8 @@ def choose_seed(
         similarities: (first, second) -> similarities (Eq. 4) of all pairs.
         size: N0.
         avoid: starts that were tried before and refused.
+        is_copy: whether two images are nearly the same picture; of those only one joins, since the seed lives on
+            parallax.
     """
     starts = [i for i, candidate in enumerate(candidates) if candidate not in avoid]
     if not starts:
@@ -42,14 +45,23 @@ def choose_seed(
     affinity[np.arange(len(starts)), starts] = -np.inf
     density = np.partition(affinity, -neighbours, axis=1)[:, -neighbours:].mean(axis=1)
     chosen = [starts[int(np.argmax(density))]]
+    copies: set[int] = set()
     links = np.zeros((len(candidates), neighbours))  # the best ones of each candidate to the blob
+    links = np.sort(np.column_stack([links, similarities(candidates, [candidates[chosen[0]]])]), axis=1)[:, 1:]
     while len(chosen) < min(size, len(candidates)):
-        new = similarities(candidates, [candidates[chosen[-1]]])
-        links = np.sort(np.column_stack([links, new]), axis=1)[:, 1:]
         # Few links count less: an image must hang on several members, not on one.
         attraction = links.sum(axis=1)
         attraction[chosen] = -np.inf
-        chosen.append(int(np.argmax(attraction)))
+        attraction[list(copies)] = -np.inf
+        best = int(np.argmax(attraction))
+        if not np.isfinite(attraction[best]):
+            break
+        if is_copy is not None and any(is_copy(candidates[best], candidates[i]) for i in chosen):
+            copies.add(best)
+            continue
+        chosen.append(best)
+        new = similarities(candidates, [candidates[best]])
+        links = np.sort(np.column_stack([links, new]), axis=1)[:, 1:]
     return tuple(candidates[i] for i in chosen)
 
 
