@@ -50,7 +50,7 @@ def opened(path: Path, name: str, pixels: bool = False) -> Iterator[Image]:
             if image.mode not in READABLE_MODES:
                 raise PhotographError(name, f"pixel type {image.mode} is not supported; convert it to 8-bit RGB")
             if pixels:
-                stream.allow(MAX_FILE_BYTES)
+                stream.allow(min(MAX_FILE_BYTES, MAX_TAG_BYTES + 2 * decoded_bytes(image)))
             yield image
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -162,7 +162,8 @@ def _export(
             checkpoint=checkpoint,
         )
         cloud = write_products(made, view).get("cloud")
-    return _summary(mapped, options, stopwatch, reference, cloud, warnings, None)
+    summary = _summary(mapped, options, stopwatch, reference, cloud, warnings, None)
+    return replace(summary, unit="m" if view.frame.metric else "map units")
 
 
 @contextlib.contextmanager
