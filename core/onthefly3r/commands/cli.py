@@ -155,6 +155,8 @@ def export(
 
         options = run_options(over_earlier(earlier_options(result), given(values)))
         again = export_run(result, out, options, here.progress)
+        for warning in again.report.get("warnings", ()):
+            here.warning(warning)
         here.result(_result_data(again), columns(_result_summary(again)))
 
 
