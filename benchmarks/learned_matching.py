@@ -60,6 +60,10 @@ class XFeatStore:
                 self._known[index] = self._extract(image)
             return self._known[index]
 
+    def more(self) -> XFeatStore:
+        """Return this store: the network gives no more."""
+        return self
+
     def _extract(self, image: WorkingImage) -> Features:
         found = self._network.detectAndCompute(image.rgb.astype(np.float32) / 255.0)[0]
         # The network sees whole multiples of 32 px and counts pixels from centre to centre.
@@ -142,6 +146,7 @@ class LearnedBackbone(ClassicalBackbone):
         super().__init__(options)
         self._features = XFeatStore(LEARNED[options.backbone])  # type: ignore[assignment]
         self._matcher = LearnedMatcher(self._threads, "lighterglue" in options.backbone)
+        self._thorough_matcher = self._matcher
 
 
 def measure(folder: Path, variant: str, out: Path, threads: int, limit: int | None) -> Mapping[str, Any]:

@@ -180,3 +180,19 @@ def test_a_pair_is_matched_once(case: Case, monkeypatch: pytest.MonkeyPatch) -> 
     again = matcher.match(features, cameras, calibrated, (3, 2, 1))
     assert len(asked) == 5
     assert set(first) == {(0, 1), (0, 2), (1, 2)} and again[1, 2] is first[1, 2]
+
+
+def test_effort_finds_more_and_keeps_the_numbers_of_features(case: Case) -> None:
+    """Images about which little is known may be asked for again: other subsets still know their features by number."""
+    known = {case.images[0].shot.camera_key: case.survey.views[0].camera}
+    harder = case.backbone.reconstruct(Subset((2, 3, 6), (4, 5), effort=1), case.images, known)
+    assert isinstance(harder, LocalModel) and set(harder.views) == set(case.batch.views)
+    assert harder.observations is not None and case.batch.observations is not None
+    assert len(harder.observations.points) > 1.1 * len(case.batch.observations.points)  # the images hold no more
+    for i in harder.views:
+        rows = harder.observations.image == i
+        number, pixel = harder.observations.feature[rows], harder.observations.pixel[rows]
+        usual = case.backbone.features_of(i, case.images[i]).pixels
+        shared = number < len(usual)
+        assert shared.sum() > 50
+        assert np.allclose(usual[number[shared]], pixel[shared])

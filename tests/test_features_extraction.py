@@ -177,3 +177,12 @@ def test_features_that_are_there_are_not_extracted_again(tmp_path: Path) -> None
     assert same(store.features_of(0, other), first)
     store.extract({0: other})
     assert same(store.load(0), first)
+
+
+def test_more_features_begin_with_those_that_are_known(tmp_path: Path) -> None:
+    image = WorkingImage(None, as_image(texture(20.0)), PixelMap(1.0, 1.0))  # type: ignore[arg-type]
+    store = FeatureStore(tmp_path, 400)
+    few, more = store.features_of(0, image), store.more().features_of(0, image)
+    assert len(few.pixels) == 400 and len(more.pixels) == 800
+    assert np.array_equal(more.pixels[:400], few.pixels) and np.array_equal(more.descriptors[:400], few.descriptors)
+    assert same(store.features_of(0, image), few) and store.more() is store.more()

@@ -203,3 +203,10 @@ def test_mutual_matches_are_the_same_from_either_side() -> None:
     assert len(np.unique(matches[:, 0])) == len(np.unique(matches[:, 1])) == len(matches)
     agreed = {tuple(pair) for pair in matches.tolist()} & {(b, a) for a, b in mutual_matches(second, first).tolist()}
     assert len(agreed) > 0.9 * len(matches)
+
+
+def test_a_thorough_comparison_keeps_more() -> None:
+    first, second, truth = two_views(MOTIONS["beside"], 5.0, points=6000)
+    usual, thorough = (verified_matches(Side(first, CAMERA), Side(second, CAMERA), 1.0, how) for how in (False, True))
+    assert len(usual) == MAX_MATCHES and len(thorough) == 2 * MAX_MATCHES
+    assert right(thorough, truth) > 0.99 * len(thorough)

@@ -40,6 +40,7 @@ class ClassicalBackbone:
             features = FeatureStore(Path(self._scratch.name), options.features, options.threads)
         self._features = features
         self._matcher = PairMatcher(self._threads)
+        self._thorough_matcher = PairMatcher(self._threads, thorough=True)  # of subsets that are tried harder
         self._checkpoint: Callable[[], None] = lambda: None
 
     def interrupt_with(self, checkpoint: Callable[[], None]) -> None:
@@ -57,13 +58,18 @@ class ClassicalBackbone:
     def reconstruct(
         self, subset: Subset, images: Mapping[int, WorkingImage], calibrations: Mapping[str, Camera]
     ) -> LocalModel | Rejection:
-        """Rebuild the subset: sparse points for all images, dense point maps for the new ones."""
+        """Rebuild the subset: sparse points for all images, dense point maps for the new ones.
+
+        A subset that asks for effort gets twice as many features and a thorough comparison of all pairs.
+        """
         members = subset.members
-        features = {i: self.features_of(i, images[i]) for i in members}
+        store = self._features.more() if subset.effort else self._features
+        matcher = self._thorough_matcher if subset.effort else self._matcher
+        features = {i: store.features_of(i, images[i]) for i in members}
         keys = {i: images[i].shot.camera_key for i in members}
         cameras = {keys[i]: _working_camera(images[i], calibrations) for i in members}
         held = frozenset(key for key in cameras if key in calibrations)
-        matches = self._matcher.match(
+        matches = matcher.match(
             features,
             {i: cameras[keys[i]] for i in members},
             {i: keys[i] in held for i in members},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,11 @@ from ..geometry.transforms import Rigid3
 from ..records import Features
 
 MIN_MODEL_SIZE = 3
+MIN_FIRST_MATCHES = 30  # of a pair that a model is begun with when the usual demands found too little
+MORE_STARTS = 3  # pairs that are tried then
+INIT_TRIALS = 20  # first pairs that pycolmap tries on its own
+ENOUGH = 0.8  # of the connected images: with so many, no other first pair is tried
+FIRST_SHIFT = 0.2  # of the image's longest side: pairs nearer to each other are worth less
 
 
 def local_sfm(
@@ -31,23 +36,81 @@ def local_sfm(
     `matches` are the verified ones (M, 2) of image pairs, rows of their features. Intrinsics of the camera keys in
     `held` stay as given; the others are refined in the bundle adjustment.
     `checkpoint` is called after every image that was added; what it raises ends the work.
+
+    A model that leaves out images which matches connect is tried again: with looser demands, then from other first
+    pairs. The largest one counts.
     """
     pycolmap = load_pycolmap()
 
     camera_ids = {key: number for number, key in enumerate(sorted(cameras), start=1)}
     cache = _database_cache(features, keys, cameras, camera_ids, matches)
-    options = _pipeline_options(threads)
-    options.constant_cameras = {camera_ids[key] for key in held if key in camera_ids}
-    manager = pycolmap.ReconstructionManager()
-    pipeline = pycolmap.IncrementalPipeline(options, cache, manager)
-    for event in pycolmap.IncrementalPipelineCallback.__members__.values():
-        pipeline.add_callback(int(event), checkpoint)
-    pipeline.run()
-    models = [manager.get(i) for i in range(manager.size())]
-    models = [model for model in models if model.num_reg_images() >= MIN_MODEL_SIZE]
-    if not models:
+    connected = _largest_connected(matches)
+    best = None
+    for attempt, options in enumerate(_attempts(threads, features, matches)):
+        options.constant_cameras = {camera_ids[key] for key in held if key in camera_ids}
+        manager = pycolmap.ReconstructionManager()
+        pipeline = pycolmap.IncrementalPipeline(options, cache, manager)
+        for event in pycolmap.IncrementalPipelineCallback.__members__.values():
+            pipeline.add_callback(int(event), checkpoint)
+        pipeline.run()
+        models = [manager.get(i) for i in range(manager.size())]
+        largest = max(models, key=lambda model: model.num_reg_images(), default=None)
+        if largest is not None and (best is None or largest.num_reg_images() > best.num_reg_images()):
+            best = largest
+        placed = 0 if best is None else best.num_reg_images()
+        if connected < MIN_MODEL_SIZE or placed >= (connected if attempt == 0 else ENOUGH * connected):
+            break
+    if best is None or best.num_reg_images() < MIN_MODEL_SIZE:
         return None
-    return _to_sparse_model(max(models, key=lambda model: model.num_reg_images()), camera_ids)
+    return _to_sparse_model(best, camera_ids)
+
+
+def _largest_connected(matches: Mapping[tuple[int, int], Int]) -> int:
+    """Return how many images the largest group has that matches connect."""
+    group: dict[int, set[int]] = {}
+    for (first, second), pairs in matches.items():
+        if len(pairs):
+            joined = group.get(first, {first}) | group.get(second, {second})
+            group.update(dict.fromkeys(joined, joined))
+    return max(map(len, group.values()), default=0)
+
+
+def _first_pairs(features: Mapping[int, Features], matches: Mapping[tuple[int, int], Int]) -> list[tuple[int, int]]:
+    """Return a few pairs to begin with that share no image: many matches, and far enough apart to be triangulated.
+
+    How far is told by the shift in the middle of the similarity between the two images: over flat ground, and for
+    cameras that look alike way down, it is the baseline over the height.
+    """
+    worth = {}
+    for (first, second), pairs in matches.items():
+        if len(pairs) >= MIN_FIRST_MATCHES:
+            here, there = features[first].pixels[pairs[:, 0]], features[second].pixels[pairs[:, 1]]
+            middle_here, middle_there = here.mean(axis=0), there.mean(axis=0)
+            u, _, vt = np.linalg.svd((there - middle_there).T @ (here - middle_here))
+            turn = u @ np.diag([1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+            centre = 0.5 * (features[first].pixels.max(axis=0) + features[first].pixels.min(axis=0))
+            shift = np.linalg.norm(turn @ (centre - middle_here) + middle_there - centre)
+            worth[first, second] = len(pairs) * min(1.0, shift / (FIRST_SHIFT * float(centre.max()) * 2.0))
+    chosen: list[tuple[int, int]] = []
+    for pair in sorted(worth, key=lambda pair: (-worth[pair], pair)):
+        if len(chosen) < MORE_STARTS and not {i for other in chosen for i in other} & set(pair):
+            chosen.append(pair)
+    return chosen
+
+
+def _attempts(threads: int, features: Mapping[int, Features], matches: Mapping[tuple[int, int], Int]) -> Iterator[Any]:
+    """Yield the options of one attempt after the other."""
+    yield _pipeline_options(threads)
+    for pair in (None, *_first_pairs(features, matches)):
+        options = _pipeline_options(threads)
+        options.mapper.abs_pose_min_num_inliers = 15
+        options.mapper.abs_pose_min_inlier_ratio = 0.15
+        options.mapper.init_min_num_inliers = MIN_FIRST_MATCHES
+        options.mapper.init_min_tri_angle = 4.0
+        options.init_num_trials = INIT_TRIALS
+        if pair is not None:
+            options.init_image_id1, options.init_image_id2 = (index + 1 for index in pair)
+        yield options
 
 
 def _database_cache(

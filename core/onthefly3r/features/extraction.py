@@ -51,6 +51,14 @@ class FeatureStore:
         self._threads = threads or os.cpu_count() or 1
         self._recent: OrderedDict[int, Features] = OrderedDict()
         self._lock = threading.Lock()
+        self._more: FeatureStore | None = None
+
+    def more(self) -> FeatureStore:
+        """Return a store of twice as many features; the first of them are those of this one, by the same numbers."""
+        with self._lock:
+            if self._more is None:
+                self._more = FeatureStore(self._folder / "more", 2 * self._max_features, self._threads)
+            return self._more
 
     def extract(self, images: Mapping[int, WorkingImage]) -> None:
         """Extract the features of several images at once, those that are not on disk yet."""

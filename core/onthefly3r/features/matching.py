@@ -36,10 +36,14 @@ SCALE_FACTOR, TURN_RAD = 1.5, 0.6  # from how the pair's features usually change
 
 
 class PairMatcher:
-    """Verified matches by image pair; a pair that two subsets share is matched once."""
+    """Verified matches by image pair; a pair that two subsets share is matched once.
 
-    def __init__(self, threads: int) -> None:
+    A thorough one compares all features of every pair with all, and keeps twice as many matches.
+    """
+
+    def __init__(self, threads: int, thorough: bool = False) -> None:
         self._threads = threads
+        self._thorough = thorough
         self._recent: OrderedDict[tuple[int, int], Int] = OrderedDict()
 
     def match(
@@ -64,6 +68,7 @@ class PairMatcher:
                     sides[pair[0]],
                     sides[pair[1]],
                     BAND_PX if calibrated[pair[0]] and calibrated[pair[1]] else PRIOR_BAND_PX,
+                    self._thorough,
                 ),
                 missing,
             )
@@ -93,13 +98,17 @@ class Side:
         self.vectors = features.descriptors.astype(np.float32)  # (N, 128), whole numbers
 
 
-def verified_matches(first: Side, second: Side, band_px: float) -> Int:
-    """Return up to `MAX_MATCHES` matches (M, 2) that agree on an epipolar geometry, best spread first; or none."""
+def verified_matches(first: Side, second: Side, band_px: float, thorough: bool = False) -> Int:
+    """Return up to `MAX_MATCHES` matches (M, 2) that agree on an epipolar geometry, best spread first; or none.
+
+    A thorough comparison takes all features from the start, and returns up to twice as many.
+    """
     focal_px = 0.5 * (first.focal_px + second.focal_px)
-    some = _mutual(first.vectors[:FIRST_FEATURES], second.vectors[:FIRST_FEATURES])
+    few = slice(None if thorough else FIRST_FEATURES)
+    some = _mutual(first.vectors[few], second.vectors[few])
     geometry = relative_geometry(first.rays[some[:, 0]], second.rays[some[:, 1]], focal_px, band_px, MIN_INLIERS)
     if geometry is None or np.count_nonzero(geometry.inliers) < WEAK_PAIR:
-        if len(some) >= MIN_HINTS and max(len(first.vectors), len(second.vectors)) > FIRST_FEATURES:
+        if not thorough and len(some) >= MIN_HINTS and max(len(first.vectors), len(second.vectors)) > FIRST_FEATURES:
             every = _mutual(first.vectors, second.vectors)
             more = relative_geometry(first.rays[every[:, 0]], second.rays[every[:, 1]], focal_px, band_px, MIN_INLIERS)
             if more is not None:
@@ -115,7 +124,7 @@ def verified_matches(first: Side, second: Side, band_px: float) -> Int:
     if len(found) < len(sure):
         found = sure
     # Features come best spread first: so do pairs of them, and the pairs of an image agree on which to keep.
-    return found[np.argsort(found.max(axis=1), kind="stable")[:MAX_MATCHES]]
+    return found[np.argsort(found.max(axis=1), kind="stable")[: MAX_MATCHES * (2 if thorough else 1)]]
 
 
 def mutual_matches(first: Features, second: Features) -> Int:
