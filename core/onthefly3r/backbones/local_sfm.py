@@ -90,7 +90,7 @@ def _first_pairs(features: Mapping[int, Features], matches: Mapping[tuple[int, i
             turn = u @ np.diag([1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
             centre = 0.5 * (features[first].pixels.max(axis=0) + features[first].pixels.min(axis=0))
             shift = np.linalg.norm(turn @ (centre - middle_here) + middle_there - centre)
-            worth[first, second] = len(pairs) * min(1.0, shift / (FIRST_SHIFT * float(centre.max()) * 2.0))
+            worth[first, second] = len(pairs) * min(1.0, float(shift) / (FIRST_SHIFT * 2.0 * float(centre.max())))
     chosen: list[tuple[int, int]] = []
     for pair in sorted(worth, key=lambda pair: (-worth[pair], pair)):
         if len(chosen) < MORE_STARTS and not {i for other in chosen for i in other} & set(pair):
