@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import struct
 import threading
 import time
 from dataclasses import replace
@@ -291,3 +292,37 @@ def test_out_of_memory_is_said_as_such(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(images_module, "_to_rgb", full)
     with pytest.raises(PhotographError, match="not enough memory"):
         load_working_image(shot, 320, patience=Patience(0.0))
+
+
+def negative(width: int = 320, height: int = 240) -> bytes:
+    """A minimal DNG: one directory with 16-bit Bayer data, no thumbnail."""
+    values = np.random.default_rng(0).integers(200, 4000, (height // 8, width // 8))
+    data = np.kron(values, np.ones((8, 8))).astype("<u2").tobytes()
+    one, matrix = struct.pack("<6I", 1, 1, 1, 1, 1, 1), struct.pack("<18i", *[1, 1, 0, 1, 0, 1, 0, 1, 1] * 2)
+    shorts = {258: 16, 259: 1, 262: 32803, 274: 1, 277: 1, 284: 1, 50714: 0, 50717: 4095, 50778: 21}
+    longs = {254: 0, 256: width, 257: height, 273: 0, 278: height, 279: len(data)}
+    entries = {tag: (3, 1, struct.pack("<HH", value, 0)) for tag, value in shorts.items()}
+    entries |= {tag: (4, 1, struct.pack("<I", value)) for tag, value in longs.items()}
+    entries |= {33421: (3, 2, struct.pack("<HH", 2, 2)), 33422: (1, 4, b"\0\1\1\2"), 50706: (1, 4, b"\1\4\0\0")}
+    entries |= {271: (2, 6, b"Maker\0"), 272: (2, 6, b"Model\0"), 50708: (2, 12, b"Maker Model\0")}
+    entries |= {50721: (10, 9, matrix), 50728: (5, 3, one)}
+    start = 8 + 2 + 12 * len(entries) + 4
+    end = start + sum(len(value) for _, _, value in entries.values() if len(value) > 4)
+    directory, further = b"", b""
+    for tag, (kind, count, value) in sorted(entries.items()):
+        if tag == 273:
+            value = struct.pack("<I", end)
+        place = value.ljust(4, b"\0") if len(value) <= 4 else struct.pack("<I", start + len(further))
+        further += value if len(value) > 4 else b""
+        directory += struct.pack("<HHI", tag, kind, count) + place
+    return b"II*\0" + struct.pack("<IH", 8, len(entries)) + directory + b"\0\0\0\0" + further + data
+
+
+def test_dng_is_read_where_the_extra_is_installed(tmp_path: Path) -> None:
+    pytest.importorskip("rawpy")
+    (tmp_path / "a.dng").write_bytes(negative())
+    shot = shot_of(tmp_path / "a.dng")
+    assert shot.camera_key == "Maker Model 320x240"
+    for longest, size in ((200, (150, 200, 3)), (100, (75, 100, 3))):
+        rgb = load_working_image(shot, longest).rgb
+        assert rgb.shape == size and rgb.std() > 20.0

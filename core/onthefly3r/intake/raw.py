@@ -1,4 +1,4 @@
-"""Digital negatives (DNG): tags by Pillow's TIFF reader, pixels developed by rawpy (extra `raw`)."""
+"""Digital negatives (DNG): tags by Pillow's EXIF reader, pixels developed by rawpy (extra `raw`)."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from PIL.Image import Exif, Image
 
 TURNED_SIDEWAYS = (5, 6)  # LibRaw's flip
+XMP_TAG = 0x02BC
 
 
 class RawImage:
@@ -19,13 +20,14 @@ class RawImage:
 
     def __init__(self, stream: IO[bytes]) -> None:
         import rawpy
-        from PIL import Image, TiffImagePlugin
+        from PIL.Image import Exif
 
-        del TiffImagePlugin
         data = stream.read()
         self._raw: Any = rawpy.imread(io.BytesIO(data))
-        self._tiff = Image.open(io.BytesIO(data), formats=("TIFF",))
-        self.info: dict[Any, Any] = self._tiff.info
+        self._exif = Exif()
+        self._exif.load_from_fp(io.BytesIO(data))
+        packet = self._exif.get(XMP_TAG)
+        self.info: dict[Any, Any] = {"xmp": bytes(packet)} if isinstance(packet, bytes | tuple) else {}
         sizes = self._raw.sizes
         upright = (sizes.height, sizes.width) if sizes.flip in TURNED_SIDEWAYS else (sizes.width, sizes.height)
         self.size: tuple[int, int] = upright
@@ -37,11 +39,10 @@ class RawImage:
     def __exit__(self, *error: object) -> None:
         """Free the sensor data."""
         self._raw.close()
-        self._tiff.close()
 
     def getexif(self) -> Exif:
         """Return the EXIF block."""
-        return self._tiff.getexif()
+        return self._exif
 
     def developed(self, longest_px: int) -> Image:
         """Return the upright picture, at half size where that is enough; brightness alike in all photographs."""
