@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -195,3 +196,13 @@ def test_no_points_give_no_tiles(tmp_path: Path) -> None:
 def test_spacing_must_be_positive(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="spacing_m"):
         list(fuse([], 0.0, 0.0, tmp_path, True))
+
+
+def test_images_behind_a_point_are_counted_once(tmp_path: Path) -> None:
+    """Points that three images agreed on bring that along: two of them in a voxel are no six images."""
+    batches = [
+        replace(batch(np.full((1, 3), 0.5), source=k, confidence=0.7), views=np.full(1, 3, np.int32)) for k in (1, 2)
+    ]
+    (fused,) = fuse(batches, 1.0, 0.0, tmp_path, stray_filter=False)
+    assert fused.views.tolist() == [3]
+    assert fused.confidence == pytest.approx(0.7, abs=1e-6)

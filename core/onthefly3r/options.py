@@ -286,6 +286,12 @@ class ExportOptions(CheckedOptions):
         "point cloud format: LAZ, LAS, or COPC, a LAZ that QGIS and other viewers open at once however large it is",
         choices=("laz", "las", "copc"),
     )
+    quality: Literal["preview", "standard", "full"] = option(
+        "standard",
+        "how the cloud is made: preview corrects the point maps that the map was built with; standard makes new ones "
+        "with the final cameras from photographs of 800 px; full makes them from photographs of 1600 px",
+        choices=("preview", "standard", "full"),
+    )
     spacing_m: float | None = option(
         None,
         "voxel size of the cloud; default: the ground sampling distance of the point maps",
@@ -403,6 +409,7 @@ PAPER_VALUES: dict[str, Any] = {
     "reference_points": 5000,
     "pose_graph": "se3",
     "refine": False,
+    "quality": "preview",
 }
 
 

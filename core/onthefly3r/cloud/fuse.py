@@ -46,12 +46,14 @@ def fuse(
     """Yield the fused cloud of overlapping batches tile by tile, one point per occupied voxel.
 
     Position and colour are means weighted by confidence; source and batch are those of the most confident
-    observation; views counts distinct images. The confidence of a voxel with n images and mean observed confidence c
-    is 1 - (1 - c)^sqrt(n): one image keeps its own, agreeing images add up, but less than independent ones would,
-    because images of one local model share its errors. Points that are not finite or have no confidence are left out.
+    observation; views counts distinct images, or what a point brings along if that is more. The confidence of a voxel
+    with n images, whose points are each the work of m images, and mean observed confidence c is
+    1 - (1 - c)^sqrt(n / m): one image keeps its own, agreeing images add up, but less than independent ones would,
+    because images of one local model share its errors. Images that a point already counts (n <= m) add nothing. Points
+    that are not finite or have no confidence are left out.
 
     Args:
-        tiles_in: unfused points in one frame in metres; one record per image or batch, any order; `views` is not read.
+        tiles_in: unfused points in one frame in metres; one record per image or batch, any order.
         spacing_m: side of the cubic voxels, m; the grid starts at the origin of the export frame.
         min_confidence: fused points below it are dropped, 0..1.
         work: folder for temporary files (40 bytes a point), removed from it at the end.
@@ -145,7 +147,10 @@ def _fuse_square(square: _Square, spacing_m: float, min_confidence: float, reach
     position = np.stack([np.bincount(group, observed * row) for row in xyz], axis=1) / weight[:, None]
     rgb = np.stack([np.bincount(group, observed * points["rgb"][:, k]) for k in range(3)], axis=1) / weight[:, None]
     mean_confidence = np.clip(weight / sizes, 0.0, 1.0)
-    confidence = (1.0 - (1.0 - mean_confidence) ** np.sqrt(views)).astype(np.float32)
+    behind = np.maximum.reduceat(points["views"][order], starts)  # images behind a point
+    more = np.maximum(views / behind, 1.0)
+    confidence = (1.0 - (1.0 - mean_confidence) ** np.sqrt(more)).astype(np.float32)
+    views = np.maximum(views, behind)
 
     in_order = observed[order]
     candidates = order[in_order == np.repeat(np.maximum.reduceat(in_order, starts), sizes)]

@@ -24,6 +24,7 @@ POINT = np.dtype(
         ("source", "<i4"),
         ("batch", "<i4"),
         ("rgb", "u1", 3),
+        ("views", "u1"),
     ],
     align=True,
 )
@@ -142,7 +143,7 @@ class Spill:
         chosen = slice(None) if len(points) == len(keep) else keep  # mostly all, which spares a copy
         points["position"], points["rgb"] = batch.points[chosen], batch.rgb[chosen]
         points["confidence"], points["source"] = batch.confidence[chosen], batch.source[chosen]
-        points["batch"] = batch.batch[chosen]
+        points["batch"], points["views"] = batch.batch[chosen], np.clip(batch.views[chosen], 1, 255)
         return points
 
     def _append(self, tile: Int, points: np.ndarray) -> None:

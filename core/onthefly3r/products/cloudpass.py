@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ..cloud.dense_cloud import dense_points, point_spacing_m
 from ..cloud.fuse import fuse
 from ..errors import InputError, ReconstructionError
 from ..records import CloudTile, GeoReference
@@ -96,13 +97,23 @@ def _handed_out(spool: CloudSpool, extent: Extent, terrain: Terrain | None) -> I
 
 def cloud_spacing_m(view: RunView) -> float:
     """Return the voxel size of the fused cloud."""
-    return view.options.export.spacing_m or view.frame.level_from_map.scale * view.state.spacing
+    quality = view.options.export.quality
+    return view.options.export.spacing_m or point_spacing_m(view.state, view.shots, view.frame.level_from_map, quality)
 
 
 def cloud_tiles(view: RunView) -> Iterator[CloudTile]:
     """Yield the fused cloud in the export frame, cut to the boundary where there is one."""
     fused = fuse(
-        _observed(view),
+        dense_points(
+            view.state,
+            view.store,
+            view.shots,
+            view.frame.level_from_map,
+            view.options,
+            view.work,
+            view.checkpoint,
+            view.dense,
+        ),
         cloud_spacing_m(view),
         view.options.export.min_confidence,
         view.work / "fusion",
@@ -115,24 +126,6 @@ def cloud_tiles(view: RunView) -> Iterator[CloudTile]:
     if view.options.export.boundary is not None:
         tiles = clipped(tiles, _boundary(Path(view.options.export.boundary), view.reference))
     return tiles
-
-
-def _observed(view: RunView) -> Iterator[CloudTile]:
-    """Yield the points of each photograph in the levelled frame."""
-    for done, stored in enumerate(view.store.stream_points(), start=1):
-        view.checkpoint("collecting points", done, len(view.state.frames))
-        count = len(stored.points)
-        if count == 0:
-            continue
-        level_from_submap = view.frame.level_from_map @ view.state.submap_pose_of(stored.index)
-        yield CloudTile(
-            points=level_from_submap.apply(stored.points.astype(float)),
-            rgb=stored.rgb,
-            confidence=stored.confidence.astype(np.float32) / np.float32(255.0),
-            source=np.full(count, stored.index, np.int32),
-            batch=np.full(count, stored.submap, np.int32),
-            views=np.ones(count, np.int32),
-        )
 
 
 def _boundary(path: Path, reference: GeoReference | None) -> Boundary:

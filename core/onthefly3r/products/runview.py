@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from .. import __version__
+from ..cloud.figures import DenseFigures
 from ..geometry.geodesy import VERTICAL_NAMES
 from ..map.state import MapState
 from ..map.store import Store
@@ -45,6 +46,11 @@ class RunView:
     def unit(self) -> str:
         """The unit of lengths in the files."""
         return "m" if self.frame.metric else "map units"
+
+    @cached_property
+    def dense(self) -> DenseFigures:
+        """What is known of the dense cloud; complete once it is written."""
+        return DenseFigures(self.options.export.quality, self.frame.metric)
 
     @cached_property
     def cameras(self) -> list[PlacedCamera]:

@@ -162,8 +162,9 @@ def _export(
             checkpoint=checkpoint,
         )
         cloud = write_products(made, view).get("cloud")
-    summary = _summary(mapped, options, stopwatch, reference, cloud, warnings, None)
-    return replace(summary, unit="m" if view.frame.metric else "map units")
+    summary = _summary(mapped, options, stopwatch, reference, cloud, [*warnings, *view.dense.warnings()], None)
+    details = {**summary.details, "dense_cloud": view.dense.told()} if cloud else summary.details
+    return replace(summary, unit="m" if view.frame.metric else "map units", details=details)
 
 
 @contextlib.contextmanager
