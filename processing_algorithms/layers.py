@@ -44,6 +44,7 @@ CAMERA_FIELDS = (
     *((name, TEXT) for name in ("status", "reason")),
     *((name, REAL) for name in ("x", "y", "z", "omega", "phi", "kappa", "yaw", "pitch", "roll")),
     *((name, REAL) for name in ("gps_x", "gps_y", "gps_z", "dx", "dy", "dz", "d_h", "d_3d", "sig_h", "sig_v")),
+    *((name, REAL) for name in ("sd_h", "sd_v", "sd_deg")),
     ("rtk", WHOLE),
     ("used", TRUTH),
     ("retries", WHOLE),

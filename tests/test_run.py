@@ -29,6 +29,7 @@ FILES = (
     *(f"{name}{suffix}" for name in ("cameras", "footprints") for suffix in (".shp", ".shx", ".dbf", ".prj", ".cpg")),
     *(f"colmap/{name}{suffix}" for name in ("cameras", "images", "points3D") for suffix in (".txt", ".bin")),
     *("colmap/offset.txt", "colmap/offset.json"),
+    *(f"exchange/{name}" for name in ("opk.txt", "shots.geojson", "metashape.xml", "pix4d.csv", "calibration.json")),
 )
 
 

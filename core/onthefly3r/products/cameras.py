@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -65,17 +66,17 @@ def camera_rows(
     rows = []
     for camera in sorted(cameras, key=lambda camera: shots[camera.index].capture_order):
         position, sigma_h_m, sigma_v_m = tagged.get(camera.index, (None, None, None))
-        rows.append(
-            placed_row(
-                camera,
-                shots[camera.index],
-                gps=position,
-                sigma_h_m=sigma_h_m,
-                sigma_v_m=sigma_v_m,
-                used=bool(reference and camera.index in reference.residuals_m),
-                convergence_deg=frame.convergence_deg(state.map_from_cam(camera.index)),
-            )
+        row = placed_row(
+            camera,
+            shots[camera.index],
+            gps=position,
+            sigma_h_m=sigma_h_m,
+            sigma_v_m=sigma_v_m,
+            used=bool(reference and camera.index in reference.residuals_m),
+            convergence_deg=frame.convergence_deg(state.map_from_cam(camera.index)),
         )
+        known = reference.deviations.get(camera.index) if reference else None
+        rows.append(replace(row, sd_h=known.h_m, sd_v=known.v_m, sd_deg=known.angle_deg) if known else row)
     for index in sorted(rejections, key=lambda index: shots[index].capture_order):
         position = tagged.get(index, (None,))[0]
         reason, tries = rejections[index].reason, retries.get(index, 0)

@@ -14,6 +14,7 @@ from typing import Any, Literal
 from ..options import ExportOptions
 from .cloudpass import Cloud, Sink
 from .copc import CopcWriter
+from .exchange import EXCHANGE_FILES, write_exchange
 from .footprints import write_footprints
 from .heightmodels import SurfaceSink
 from .las import CloudWriter, las_scale_m
@@ -122,6 +123,10 @@ def _model(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
     write_colmap(out / "colmap", view.cameras, view.state, view.store, view.shots, view.frame)
 
 
+def _exchange(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
+    write_exchange(out, view.cameras, view.rows, view.crs)
+
+
 def _preview(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
     write_preview(
         out / "preview.png", made["cloud"], view.rows, view.title, georeferenced=view.crs is not None, unit=view.unit
@@ -189,6 +194,7 @@ PRODUCTS: tuple[Product, ...] = (
         _always,
         _model,
     ),
+    Product("exchange", "Cameras for other programs", EXCHANGE_FILES, _always, _exchange),
     Product("preview", "Preview picture", ("preview.png",), _with_cloud, _preview),
     Product("report", "Report", ("report.json", "report.html"), _always),  # written last by the run, whatever happens
 )

@@ -35,6 +35,9 @@ class CameraRow:
     gps_z: float | None = None
     sig_h: float | None = None  # standard deviation of the tagged position that was used
     sig_v: float | None = None
+    sd_h: float | None = None  # standard deviation of the adjusted camera, m per horizontal axis
+    sd_v: float | None = None  # m
+    sd_deg: float | None = None  # per angle
     rtk: int | None = None  # DJI RtkFlag
     used: bool = False  # the tagged position took part in georeferencing
     retries: int = 0
