@@ -14,7 +14,7 @@ from ..records import Shot
 TIMED_PHOTOGRAPHS = 3
 # One photograph takes about so many times as long as finding its features; the dense part follows the share of its
 # pixels. Measured on surveys of 12 to 172 photographs.
-SPARSE_FACTOR, DENSE_FACTOR = 2.5, 10.0
+SPARSE_FACTOR, DENSE_FACTOR = 6.0, 25.0
 BASE_MIB, IMAGE_MIB, MOST_IMAGES_MIB = 350.0, 9.0, 700.0  # at 1000 px; only the last images stay in memory
 
 
