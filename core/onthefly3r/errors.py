@@ -8,7 +8,9 @@
     │   ├── BusyError            another process works in the output folder
     │   └── MissingDependencyError the interpreter lacks a package or a system library
     ├── ReconstructionError      nothing could be reconstructed (exit 3, the report is still written)
-    │   └── GeoreferenceError    the map cannot be tied to the Earth (exit 3, the report is still written)
+    │   ├── GeoreferenceError    the map cannot be tied to the Earth (exit 3, the report is still written)
+    │   ├── MisfitError          the result contradicts itself or its positions by far (exit 3, files are written)
+    │   └── IncompleteError      fewer than half of the photographs are placed (exit 5, files are written)
     ├── StorageError             no room on the disk or no access to a file (exit 4)
     └── Cancelled                the caller asked to stop (exit 130)
 
@@ -67,6 +69,16 @@ class ReconstructionError(OnTheFly3RError):
 
 class GeoreferenceError(ReconstructionError):
     """The map cannot be tied to the Earth with the positions at hand."""
+
+
+class MisfitError(ReconstructionError):
+    """The result contradicts itself or its positions by far; its files are written all the same."""
+
+
+class IncompleteError(ReconstructionError):
+    """Fewer than half of the photographs are placed; the files of those that are, are written."""
+
+    exit_code = 5
 
 
 class StorageError(OnTheFly3RError):

@@ -278,6 +278,9 @@ class GeoreferenceOptions(CheckedOptions):
 class ExportOptions(CheckedOptions):
     """The files in the output folder."""
 
+    allow_partial: bool = option(
+        False, "take a result for one, exit code 0, even if it holds fewer than half of the photographs"
+    )
     cloud: bool = option(
         True, "write the point cloud; without it, cameras, footprints, COLMAP model and report are written"
     )

@@ -395,6 +395,7 @@ class PlacedCamera:
     world_from_cam: Rigid3
     batch: int
     retries: int = 0
+    part: int = 1  # of the map, the largest first; what nothing connects lies in different parts
 
 
 @dataclass(frozen=True)

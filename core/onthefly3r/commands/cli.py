@@ -1,7 +1,7 @@
 """The command line: run, batch, check, export, evaluate, simulate, demo, doctor, view.
 
 Exit codes: 0 done, 2 the input is wrong, 3 nothing reconstructed or georeferenced, 4 no room or no access,
-130 cancelled, 1 unexpected.
+5 fewer than half of the photographs placed, 130 cancelled, 1 unexpected.
 """
 
 from __future__ import annotations

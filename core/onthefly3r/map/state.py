@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from itertools import islice
 
@@ -99,7 +99,11 @@ class MapState:
         """Return one fragment as a map of its own: what is moved there moves here too."""
         if all(number == fragment for number in self.fragment_of_submap.values()):
             return self
-        return MapPart(self, fragment)
+        return MapPart(self, (fragment,))
+
+    def parts(self, fragments: Collection[int]) -> MapState:
+        """Return some fragments as a map; only where they were brought into one frame."""
+        return self if {*self.fragment_of_submap.values()} <= {*fragments} else MapPart(self, fragments)
 
     def last_accepted(self, count: int) -> list[int]:
         """Return the last frames of A_k in the order of their acceptance."""
@@ -209,14 +213,13 @@ class MapState:
 
 
 class MapPart(MapState):
-    """One fragment of a map as it is now: a map to read and to move, but not to add to."""
+    """Some of the fragments of a map as it is now: a map to read and to move, but not to add to."""
 
-    def __init__(self, whole: MapState, fragment: int) -> None:
+    def __init__(self, whole: MapState, fragments: Collection[int]) -> None:
         super().__init__(whole._store)
         self._whole = whole
-        submaps = [number for number, label in whole.fragment_of_submap.items() if label == fragment]
-        self.fragment_of_submap = dict.fromkeys(submaps, fragment)
-        self.map_from_submap = {number: whole.map_from_submap[number] for number in submaps}
+        self.fragment_of_submap = {n: label for n, label in whole.fragment_of_submap.items() if label in fragments}
+        self.map_from_submap = {number: whole.map_from_submap[number] for number in self.fragment_of_submap}
         self.frames = {i: frame for i, frame in whole.frames.items() if frame.submap in self.map_from_submap}
         self.sightings = [
             seen for seen in whole.sightings if seen.submap in self.map_from_submap and seen.frame in self.frames

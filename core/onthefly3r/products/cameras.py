@@ -22,6 +22,7 @@ def placed_cameras(
 ) -> list[PlacedCamera]:
     """Return the accepted cameras in the export frame, at photograph size, in the order of the shots."""
     placed = []
+    part_of = {i: part for part, frames in enumerate(state.fragments().values(), start=1) for i in frames}
     for index in sorted(state.frames):
         shot, stored = shots[index], state.frames[index]
         placed.append(
@@ -33,6 +34,7 @@ def placed_cameras(
                 world_from_cam=frame.pose(state.map_from_cam(index)),
                 batch=stored.submap,
                 retries=retries.get(index, 0),
+                part=part_of[index],
             )
         )
     return placed

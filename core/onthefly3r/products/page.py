@@ -25,6 +25,7 @@ REMEDIES = {
     "backbone": "Too few common details: water, snow, uniform fields, motion blur, or too little overlap.",
     "alignment": "The photograph fits its neighbours, but they do not fit the map: often repeating patterns.",
     "references": "The photographs it was compared with moved too much: often repeating patterns.",
+    "fragments": "Reconstructed, but apart from the rest, and without positions that tell where.",
     "queries": "The place that was found contradicts what the map shows: often repeating patterns.",
 }
 GEOID = {

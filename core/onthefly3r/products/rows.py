@@ -42,6 +42,7 @@ class CameraRow:
     used: bool = False  # the tagged position took part in georeferencing
     retries: int = 0
     batch: int | None = None
+    part: int | None = None  # of the map: what nothing connects lies in different parts
     t_utc: str = ""  # ISO 8601, in the camera's own clock
     cam: str = ""  # camera key
 
@@ -128,6 +129,7 @@ def placed_row(
         used=used,
         retries=camera.retries,
         batch=camera.batch,
+        part=camera.part,
         t_utc=_iso_time(shot.time_s),
         cam=shot.camera_key,
     )

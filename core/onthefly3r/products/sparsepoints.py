@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from ..geometry.arrays import Float, UInt8
 from ..geometry.orientation import is_turn, stored_camera, stored_pixels, stored_pose
 from ..map.state import MapState
 from ..map.store import Store
-from ..records import Frame, PlacedCamera, Shot
+from ..records import Frame, Observations, PlacedCamera, Shot
 from .colmap import SparsePoints, write_model
 from .exportframe import ExportFrame
 from .localframe import local_from_map, write_offset
@@ -45,7 +45,7 @@ def write_colmap(
         )
         for placed in cameras
     ]
-    found = intersected_tracks(state, store.stream_observations(), shots) or _references(state)
+    found = intersected_tracks(state, _observed(state, store), shots) or _references(state)
     pixels = found.pixel.copy()
     for index in np.unique(found.image):
         rows, shot = found.image == index, shots[int(index)]
@@ -74,6 +74,11 @@ def _references(state: MapState) -> Intersected:
     joined = np.vstack(points)
     number = np.arange(len(joined))
     return Intersected(joined, np.zeros(len(joined)), np.concatenate(images), number, np.vstack(pixels))
+
+
+def _observed(state: MapState, store: Store) -> Iterator[tuple[int, Observations]]:
+    """Yield the observations of the submaps of a map, which may be a part of what was stored."""
+    return ((number, found) for number, found in store.stream_observations() if number in state.map_from_submap)
 
 
 def _colours(found: Intersected, state: MapState, store: Store) -> UInt8:

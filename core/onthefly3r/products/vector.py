@@ -40,6 +40,7 @@ FIELDS: tuple[tuple[str, str, int, int], ...] = (
     ("used", "L", 1, 0),
     ("retries", "N", 6, 0),
     ("batch", "N", 9, 0),
+    ("part", "N", 4, 0),
     ("t_utc", "C", 24, 0),
     ("cam", "C", 120, 0),
 )

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..earth.control_file import control_of
-from ..earth.control_reference import earth_reference
 from ..earth.georef import check_crs
 from ..earth.ground import ground_normal
 from ..errors import InputError
@@ -19,6 +18,7 @@ from ..products.clip import require_boundary_near
 from ..protocol import ProgressCallback
 from ..records import GeoReference, Shot
 from ..stopwatch import Stopwatch
+from .parts import main_part, main_reference
 from .record import RunRecord
 from .result import Mapped, Result, write_result
 from .run_folder import FAILURE, PRODUCT_FILES, RESULT, RunFolder, settle
@@ -57,8 +57,7 @@ def georeference(run: Path, options: Options | None = None) -> GeoReference:
     options = options or Options()
     mapped = open_run(Path(run), options)
     state = mapped.state
-    poses = {index: state.map_from_cam(index) for index in state.frames}
-    return earth_reference(state.tie, poses, mapped.record.shots, options.georeference, ground_normal(state))
+    return main_reference(state, mapped.record.shots, options.georeference, ground_normal(main_part(state)))
 
 
 def open_run(run: Path, options: Options) -> Mapped:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..earth.control_reference import earth_reference
 from ..earth.georef import metres_per_map_unit
 from ..earth.ground import ground_normal
 from ..errors import Cancelled, GeoreferenceError, ReconstructionError
@@ -25,8 +24,10 @@ from ..products.writing import write_products
 from ..protocol import Progress, ProgressCallback
 from ..records import GeoReference
 from ..stopwatch import Stopwatch, peak_rss_mib
+from .parts import laid_out, main_part, main_reference
 from .record import RunRecord
 from .run_folder import FAILED_REPORTS, FAILURE, REPORTS, RESULT, RunFolder
+from .verdict import misfits, raise_for, shortfall
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ def write_result(
         made = made / "files"
         made.mkdir()
         try:
-            summary = _export(folder, made, mapped, options, stopwatch, progress, cancel)
+            summary, misfit, is_far = _export(folder, made, mapped, options, stopwatch, progress, cancel)
         except Exception as error:
             if not isinstance(error, Cancelled):
                 write_failure(folder, mapped, options, stopwatch, error)
@@ -80,6 +81,11 @@ def write_result(
         for index in stale:  # QGIS would show it instead of the new cloud
             index.remove()
     cloud = summary.cloud.path.name if summary.cloud else None
+    try:
+        raise_for(summary.placed, summary.given, misfit, is_far, options.export.allow_partial)
+    except ReconstructionError as error:
+        error.report = folder.path / REPORTS[0]
+        raise
     for foreign in indexes_beside(folder.path / cloud) if cloud else ():
         report["warnings"].append(
             f"{foreign.path} was not made from this cloud: QGIS may show it instead; move it away"
@@ -116,8 +122,11 @@ def _export(
     stopwatch: Stopwatch,
     progress: ProgressCallback | None,
     cancel: Callable[[], bool] | None,
-) -> RunSummary:
-    """Georeference the map and write its products into `made`."""
+) -> tuple[RunSummary, list[str], bool]:
+    """Georeference the map and write its products into `made`; return the misfits too, and whether they are too large.
+
+    What is worst is told first.
+    """
     state, record = mapped.state, mapped.record
     reference: GeoReference | None = None
     metres_per_unit: float | None = None
@@ -137,15 +146,19 @@ def _export(
         )
     with stopwatch.stage("georeference"):
         checkpoint("georeferencing", 0, 1)
-        poses = {index: state.map_from_cam(index) for index in state.frames}
         with _solver_errors():
-            up = ground_normal(state)
+            main = main_part(state)
+            poses = {index: main.map_from_cam(index) for index in main.frames}
+            up = ground_normal(main)
             if options.georeference.local:
                 metres_per_unit = metres_per_map_unit(poses, record.shots, options.georeference)
                 if metres_per_unit is None:
                     warnings.append("no positions tell the scale: the units of the local frame are not metres")
             else:
-                reference = earth_reference(state.tie, poses, record.shots, options.georeference, up)
+                reference = main_reference(state, record.shots, options.georeference, up)
+            state, reference, lost, apart = laid_out(state, record.shots, options.georeference, reference)
+            record = replace(record, rejections={**record.rejections, **lost})
+            mapped = replace(mapped, state=state, record=record)
     with stopwatch.stage("export"):
         view = RunView(
             title=folder.path.resolve().name,
@@ -162,9 +175,12 @@ def _export(
             checkpoint=checkpoint,
         )
         cloud = write_products(made, view).get("cloud")
-    summary = _summary(mapped, options, stopwatch, reference, cloud, [*warnings, *view.dense.warnings()], None)
+    given = len(record.shots) + len(record.refused)
+    misfit, is_far = misfits(record.details, record.shots, reference)
+    told = [*shortfall(len(state.frames), given), *misfit, *apart, *warnings, *view.dense.warnings()]
+    summary = _summary(mapped, options, stopwatch, reference, cloud, told, None)
     details = {**summary.details, "dense_cloud": view.dense.told()} if cloud else summary.details
-    return replace(summary, unit="m" if view.frame.metric else "map units", details=details)
+    return replace(summary, unit="m" if view.frame.metric else "map units", details=details), misfit, is_far
 
 
 @contextlib.contextmanager
