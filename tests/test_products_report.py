@@ -49,7 +49,7 @@ def summary() -> RunSummary:
 
 def test_keys_and_values() -> None:
     report = build_report(summary(), 512.0)
-    assert set(report["software"]) == {"version", "backbone", "options"}
+    assert set(report["software"]) == {"version", "backbone", "command", "options"}
     assert report["software"]["options"]["batch_size"] == 5
     assert report["images"] == {
         "given": 20,

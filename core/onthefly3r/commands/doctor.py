@@ -48,7 +48,6 @@ PACKAGES = (
     Package("laspy", "laspy"),
     Package("pyshp", "shapefile"),
     Package("rasterio", "rasterio"),
-    Package("jinja2", "jinja2"),
     Package("shapely", "shapely"),
     Package("pillow", "PIL"),
     Package("threadpoolctl", "threadpoolctl"),

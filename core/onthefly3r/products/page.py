@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from ..files.atomic import write_text
+from .reportfigures import Figure
+from .verdict import WORDS, lights, sentence
 
 STYLE = """
 body { font: 15px/1.5 sans-serif; margin: 2em auto; max-width: 60em; padding: 0 1em; color: #1d2126; }
 h1 { font-size: 1.5em; } h2 { font-size: 1.15em; margin-top: 1.8em; }
 table { border-collapse: collapse; } td, th { padding: .2em 1em .2em 0; text-align: left; vertical-align: top; }
 th { border-bottom: 1px solid #aab; } .note { color: #566; } .bad { color: #a61b1b; }
-img { max-width: 100%; border: 1px solid #ccd; }
+img { max-width: 100%; border: 1px solid #ccd; } svg { max-width: 100%; border: 1px solid #ccd; background: #f4f5f7; }
+svg.small { width: 18em; } .row { display: flex; flex-wrap: wrap; gap: 1em; } figure { margin: 0; max-width: 20em; }
+figcaption { color: #566; font-size: .9em; overflow-wrap: anywhere; } code { overflow-wrap: anywhere; }
+.verdict { font-size: 1.2em; } .light { display: inline-block; width: .9em; height: .9em; border-radius: 50%; }
+.green { background: #1a9850; } .amber { background: #f9a825; } .red { background: #c62828; }
+.grey { background: #aab; }
+.placed { fill: #2dd4eb; stroke: #181a1e; } .rejected { stroke: #ff5252; stroke-width: 3; fill: none; }
+.arrow { stroke: #ffe000; stroke-width: 2; fill: none; } .bar { fill: #4a6fa5; }
+@media print { body { margin: 0; max-width: none; } figure, table, svg { break-inside: avoid; } }
 """
 
 # What helps when a stage refuses photographs; shown once per stage that did.
@@ -35,13 +46,22 @@ GEOID = {
 }
 
 
-def write_page(path: Path, report: Mapping[str, Any], title: str) -> None:
+def write_page(path: Path, report: Mapping[str, Any], title: str, drawn: Sequence[Figure] = ()) -> None:
     """Write the page of a report as `report.build_report` makes it."""
-    write_text(path, page(report, title, preview=(path.parent / "preview.png").is_file()))
+    picture = path.parent / "preview.png"
+    encoded = base64.b64encode(picture.read_bytes()).decode("ascii") if picture.is_file() else None
+    write_text(path, page(report, title, encoded, drawn))
 
 
-def page(report: Mapping[str, Any], title: str, preview: bool) -> str:
-    """Return the whole page; everything that comes from photographs is escaped."""
+def page(report: Mapping[str, Any], title: str, preview: str | None, drawn: Sequence[Figure] = ()) -> str:
+    """Return the whole page in one file; everything that comes from photographs is escaped.
+
+    Args:
+        report: as `report.build_report` makes it.
+        title: of the page.
+        preview: the preview picture, PNG in base 64, where there is one.
+        drawn: figures, whose HTML is escaped already.
+    """
     parts = [
         "<!DOCTYPE html>",
         '<html lang="en"><head><meta charset="utf-8">',
@@ -50,20 +70,38 @@ def page(report: Mapping[str, Any], title: str, preview: bool) -> str:
     ]
     if report["error"]:
         parts.append(f'<p class="bad">{escape(report["error"])}</p>')
+    else:
+        parts += _verdict(report)
     parts += [f'<p class="bad">{escape(text)}</p>' for text in report["attention"]]
     parts.append(_table(_summary(report)))
-    if preview and not report["error"]:
-        parts.append('<p><img src="preview.png" alt="The cloud from above with the cameras"></p>')
+    if preview and not report["error"] and not drawn:
+        parts.append(f'<p><img src="data:image/png;base64,{preview}" alt="The cloud from above with the cameras"></p>')
     if report["warnings"]:
         parts.append("<h2>Warnings</h2><ul>" + "".join(f"<li>{escape(w)}</li>" for w in report["warnings"]) + "</ul>")
+    for figure in drawn:
+        parts.append(f"<h2>{escape(figure.heading)}</h2>{figure.html}")
+        if figure.note:
+            parts.append(f'<p class="note">{escape(figure.note)}</p>')
     parts += _georeference(report["georeference"])
     parts += _rejected(report["images"]["rejected"])
     parts += _timing(report)
     parts += _backbone(report["backbone"])
     parts.append("<h2>Options</h2>" + _table([(n, _text(v)) for n, v in report["software"]["options"].items()]))
+    command = report["software"].get("command")
+    if command:
+        parts.append(f"<h2>The command that repeats it</h2><p><code>{escape(command)}</code></p>")
     version, backbone = report["software"]["version"], report["software"]["backbone"]
     parts.append(f'<p class="note">On-the-Fly3R {escape(version)}, backbone {escape(backbone)}</p></body></html>')
     return "\n".join(parts) + "\n"
+
+
+def _verdict(report: Mapping[str, Any]) -> list[str]:
+    rows = "".join(
+        f'<tr><td><span class="light {light.colour}"></span></td><td>{escape(light.name)}</td>'
+        f"<td>{WORDS[light.colour]}</td><td>{escape(light.text)}</td></tr>"
+        for light in lights(report)
+    )
+    return [f'<p class="verdict">{escape(sentence(report))}</p>', f"<table>{rows}</table>"]
 
 
 def _summary(report: Mapping[str, Any]) -> list[tuple[str, str]]:

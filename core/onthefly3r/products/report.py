@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,8 @@ from ..options import Options
 from ..records import GeoReference
 from .accuracy import accuracy_report
 from .las import CloudSummary
+from .reportfigures import Figure, facts_of
+from .verdict import LEAST_SHARE
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,8 @@ class RunSummary:
     timing: Timing
     georeference: GeoReference | None = None
     cloud: CloudSummary | None = None
+    products: Mapping[str, Any] = field(default_factory=dict)  # what `writing.write_products` returned
+    figures: Sequence[Figure] = ()  # of the page
     error: str | None = None  # why the run ended early
     warnings: Sequence[str] = ()
     details: Mapping[str, Any] = field(default_factory=dict)  # further figures, JSON values
@@ -59,7 +64,7 @@ class RunSummary:
 def attention(placed: int, given: int, georeference: GeoReference | None) -> list[str]:
     """Return what must be known before anything else: that much of the input is not in the result, or is doubted."""
     told = []
-    if 2 * placed <= given and placed:
+    if 0 < placed < LEAST_SHARE * given:
         told.append(
             f"only {placed} of {given} photographs are in the result: the rest did not fit together, or overlaps too "
             "little; the report lists why"
@@ -77,7 +82,12 @@ def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
     """Return the report as JSON values: numbers that are not finite become None, paths their file name."""
     geo, cloud, timing = run.georeference, run.cloud, run.timing
     report: dict[str, Any] = {
-        "software": {"version": __version__, "backbone": run.backbone, "options": run.options.to_flat()},
+        "software": {
+            "version": __version__,
+            "backbone": run.backbone,
+            "options": run.options.to_flat(),
+            "command": _command(run.options),
+        },
         "backbone": dict(run.backbone_facts),
         "images": {
             "given": run.given,
@@ -110,6 +120,7 @@ def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
             "mean_spacing": cloud.mean_spacing_m,
             "unit": run.unit,
         },
+        **facts_of(run.products),
         "timing": {
             "total_s": timing.total_s,
             "per_image_s": timing.total_s / run.given if run.given else None,
@@ -124,6 +135,18 @@ def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
         "details": dict(run.details),
     }
     return dict(_plain(report))
+
+
+def _command(options: Options) -> str:
+    """Return the command line that gives the same options."""
+    words = ["onthefly3r", "run", "PHOTOS", "OUT"]
+    for name, value in sorted(options.to_named().items()):
+        flag = name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        elif value is not None:
+            words += [f"--{flag}", shlex.quote(str(value))]
+    return " ".join(words)
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:

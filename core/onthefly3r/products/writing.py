@@ -14,6 +14,8 @@ from .runview import RunView
 def write_products(out: Path, view: RunView) -> dict[str, Any]:
     """Write everything that is wanted but the report into `out`, an empty folder; return what was made, by product.
 
+    `far_points` is how many points were left out because they lie far outside the survey.
+
     Raises `ReconstructionError` when a cloud is wanted and has no points.
     """
     wanted = [product for product in PRODUCTS if product.wanted(view.options.export)]
@@ -34,4 +36,4 @@ def _cloud_pass(out: Path, view: RunView, products: list[Product]) -> dict[str, 
             view.checkpoint("writing the cloud", done, cloud.tiles)
             for sink in sinks.values():
                 sink.add(tile)
-    return {name: sink.summary for name, sink in sinks.items()}
+    return {"far_points": cloud.left_out, **{name: sink.summary for name, sink in sinks.items()}}

@@ -19,6 +19,7 @@ from ..products.exportframe import ExportFrame
 from ..products.las import CloudSummary
 from ..products.page import write_page
 from ..products.report import RejectedImage, RunSummary, Timing, build_report, write_report
+from ..products.reportfigures import figures
 from ..products.runview import RunView
 from ..products.writing import write_products
 from ..protocol import Progress, ProgressCallback
@@ -174,13 +175,22 @@ def _export(
             work=made.parent,
             checkpoint=checkpoint,
         )
-        cloud = write_products(made, view).get("cloud")
+        products = write_products(made, view)
+        drawn = figures(view, made)
+    if products.get("far_points"):
+        warnings.append(f"{products['far_points']:,} points far outside the survey are left out of all products")
+    unread = products["orthophoto"].missing if products.get("orthophoto") else ()
+    if unread:
+        named = ", ".join(unread[:5])
+        warnings.append(f"{len(unread)} photographs could not be read again for the orthophoto: {named}")
+    cloud = products.get("cloud")
     given = len(record.shots) + len(record.refused)
     misfit, is_far = misfits(record.details, record.shots, reference)
     told = [*shortfall(len(state.frames), given), *misfit, *apart, *warnings, *view.dense.warnings()]
     summary = _summary(mapped, options, stopwatch, reference, cloud, told, None)
     details = {**summary.details, "dense_cloud": view.dense.told()} if cloud else summary.details
-    return replace(summary, unit="m" if view.frame.metric else "map units", details=details), misfit, is_far
+    unit = "m" if view.frame.metric else "map units"
+    return replace(summary, unit=unit, details=details, products=products, figures=drawn), misfit, is_far
 
 
 @contextlib.contextmanager
@@ -235,7 +245,7 @@ def _summary(
 def _write_report(made: Path, names: tuple[str, str], folder: RunFolder, summary: RunSummary) -> dict[str, Any]:
     report = build_report(summary, peak_rss_mib())
     write_report(made / names[0], report)
-    write_page(made / names[1], report, folder.path.resolve().name)
+    write_page(made / names[1], report, folder.path.resolve().name, summary.figures)
     return report
 
 
