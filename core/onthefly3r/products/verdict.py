@@ -79,7 +79,7 @@ def _overlap(report: Mapping[str, Any]) -> Light:
 def _layers(report: Mapping[str, Any]) -> Light:
     name = "Internal consistency"
     layers = report["details"].get("dense_cloud", {}).get("layers", {})
-    spread = (layers.get("averaged") or layers.get("single") or {}).get("median_m")
+    spread = (layers.get("averaged") or layers.get("single") or {}).get("median")
     gsd_m = (report.get("orthophoto") or {}).get("gsd_m")
     if spread is None or not gsd_m:
         return Light(name, "grey", "not measured")
