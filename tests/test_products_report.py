@@ -113,7 +113,7 @@ def test_strict_json_and_undecodable_names(tmp_path: Path) -> None:
 def test_the_first_warning_says_when_much_is_missing_or_doubtful() -> None:
     few = replace(summary(), placed=10)
     assert build_report(few, None)["warnings"][0].startswith("only 10 of 20 photographs are in the result")
-    assert build_report(replace(summary(), placed=18), None)["warnings"][0] == "one"
+    assert build_report(replace(summary(), placed=11), None)["warnings"][0] == "one"
     residuals = dict.fromkeys(range(18), (0.0, 0.0, 0.0))
     doubtful = replace(summary(), georeference=replace(GEO, n_used=12, n_outliers=6, residuals_m=residuals))
     assert build_report(doubtful, None)["warnings"][0].startswith("6 of 18 positions disagree with the map")

@@ -10,7 +10,7 @@ from typing import Any
 
 from ..files.atomic import write_text
 from .reportfigures import Figure
-from .verdict import WORDS, lights, sentence
+from .trafficlights import WORDS, lights, sentence
 
 STYLE = """
 body { font: 15px/1.5 sans-serif; margin: 2em auto; max-width: 60em; padding: 0 1em; color: #1d2126; }

@@ -17,7 +17,6 @@ from ..records import GeoReference
 from .accuracy import accuracy_report
 from .las import CloudSummary
 from .reportfigures import Figure, facts_of
-from .verdict import LEAST_SHARE
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class RunSummary:
 def attention(placed: int, given: int, georeference: GeoReference | None) -> list[str]:
     """Return what must be known before anything else: that much of the input is not in the result, or is doubted."""
     told = []
-    if 0 < placed < LEAST_SHARE * given:
+    if 2 * placed <= given and placed:
         told.append(
             f"only {placed} of {given} photographs are in the result: the rest did not fit together, or overlaps too "
             "little; the report lists why"
