@@ -97,6 +97,8 @@ def _collected(
     points: list[Float] = [np.zeros((0, 3))]
     offset = 0
     for submap, found in observed:
+        if submap not in state.map_from_submap:  # of a part of the map that is not looked at
+            continue
         placed = np.isin(found.image, list(state.frames))
         image = found.image[placed]
         depth = np.full(len(image), np.nan)
