@@ -18,7 +18,7 @@ from ..geometry.transforms import Rigid3, Sim3
 from ..options import Options
 from ..records import Shot
 from .control import Control
-from .control_fit import control_similarity, exchanged_axes, scatter_warning
+from .control_fit import control_similarity, exchanged_axes, is_poor, scatter_warning
 from .control_marks import PlacedMarks, placed_marks, triangulated, wrong_marks
 from .georef import georeference, levelled
 from .levelfit import LevelFit
@@ -118,10 +118,11 @@ def control_start(
                 f"control: {label} is {distance:.2f} m off the other points and is left out: wrong mark or coordinates"
                 for label, distance in zip(bad, off[~good], strict=True)
             ]
-            told += scatter_warning(labels, scatter, sigma)
+            poor = is_poor(scatter, enu, sigma)
+            told += scatter_warning(labels, scatter, sigma) if poor else []
             keep = np.array([label not in bad for label in labels])
             labels = [label for label in labels if label not in bad]
-            enu, sigma = enu[keep], sigma[keep] * max(1.0, scatter if scatter > 3.0 else 1.0)
+            enu, sigma = enu[keep], sigma[keep] * (scatter if poor else 1.0)
             start = replace(start, enu_from_map=similarity) if start else BlockStart(similarity, frame)
     if start is None:
         raise GeoreferenceError("no control point has a height")

@@ -15,7 +15,8 @@ from ..geometry.umeyama import weighted_similarity
 MIN_CONTROL = 3
 MOST_TRIPLES = 600
 OUTLIER = 4.0  # robust standard deviations
-NOTEWORTHY = 3.0  # times the stated accuracy: control that scatters more is told and believed less
+NOTEWORTHY = 3.0  # times the stated accuracy: control that scatters more is told and believed less,
+BENT = 0.005  # where it also scatters by this share of its extent; less may be how the block is bent before it is tied
 LINE_RATIO = 0.03  # second over first extent of control that lies on one line
 
 
@@ -56,7 +57,9 @@ def control_similarity(points: Float, control_m: Float, sigma_m: Float, seed: in
     for _ in range(10):
         ratio = _misfit(best, points, control_m, sigma_m)
         scatter = max(1.0, _scatter(ratio))
-        now = ratio <= OUTLIER * scatter if n > MIN_CONTROL else np.ones(n, bool)
+        off = np.linalg.norm(control_m - best.apply(points), axis=1)
+        now = (ratio <= OUTLIER * scatter) | (off <= 2.0 * BENT * extent_m(control_m))
+        now = now if n > MIN_CONTROL else np.ones(n, bool)
         if now.sum() < MIN_CONTROL:
             break
         best = weighted_similarity(points[now], control_m[now], 1.0 / np.square(sigma_m[now, 0]))
@@ -78,10 +81,18 @@ def exchanged_axes(points: Float, control_m: Float, sigma_m: Float) -> bool:
     return mirrored < 0.2 * as_given
 
 
+def extent_m(control_m: Float) -> float:
+    """Return the greatest distance of control from its middle."""
+    return float(np.linalg.norm(control_m - control_m.mean(axis=0), axis=1).max(initial=0.0))
+
+
+def is_poor(scatter: float, control_m: Float, sigma_m: Float) -> bool:
+    """Return whether control scatters far more than it states, and more than a block may be bent."""
+    return scatter > NOTEWORTHY and scatter * float(np.median(sigma_m[:, 0])) > BENT * extent_m(control_m)
+
+
 def scatter_warning(labels: Sequence[str], scatter: float, sigma_m: Float) -> list[str]:
     """Return what to say of control that scatters far more than it states."""
-    if scatter <= NOTEWORTHY:
-        return []
     stated = float(np.median(sigma_m[:, 0]))
     return [
         f"control: the {len(labels)} points scatter {scatter * stated:.2g} m about the block where {stated:.2g} m is "

@@ -236,6 +236,11 @@ class MapPart(MapState):
         """Refuse: batches are added to the whole map."""
         raise TypeError("a part of a map is not added to; commit to the map itself")
 
+    def set_tie(self, tie: EarthTie) -> None:
+        """Take it over for the whole map, whose largest fragment this must be."""
+        self.tie = tie
+        self._whole.set_tie(tie)
+
     def move_submaps(
         self, map_from_submap: Mapping[int, Sim3], of_frames: Mapping[int, Sim3], curvatures_of: Mapping[int, Float]
     ) -> None:
