@@ -16,6 +16,7 @@ from .cloudpass import Cloud, Sink
 from .copc import CopcWriter
 from .exchange import EXCHANGE_FILES, write_exchange
 from .footprints import write_footprints
+from .geopackage import write_geopackage
 from .heightmodels import SurfaceSink
 from .las import CloudWriter, las_scale_m
 from .orthophoto import OrthoSummary, write_orthophoto
@@ -115,6 +116,10 @@ def _footprints(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
     write_footprints(out / "footprints.shp", view.footprints, view.crs)
 
 
+def _geopackage(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
+    write_geopackage(out / "survey.gpkg", view.rows, view.footprints, view.crs)
+
+
 def _trajectory(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
     write_trajectory(out / "trajectory.csv", view.rows)
 
@@ -182,6 +187,7 @@ PRODUCTS: tuple[Product, ...] = (
         _footprints,
         layers=(Layer("footprints.shp", "Footprints", "vector", 60, "footprints.qml", shown=False),),
     ),
+    Product("geopackage", "Cameras, rejected photographs, footprints", ("survey.gpkg",), _always, _geopackage),
     Product("trajectory", "Camera poses as a table", ("trajectory.csv",), _always, _trajectory),
     Product(
         "colmap",
