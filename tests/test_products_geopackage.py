@@ -17,7 +17,7 @@ ROWS = [
     CameraRow("bad\udcff.jpg", 2, "rejected", reason="no 'similar' photograph", gps_x=1.0, gps_y=2.0),
     CameraRow("lost.jpg", 3, "rejected", reason="damaged"),
 ]
-OUTLINE = np.array([[0.0, 0.0], [0.0, 10.0], [20.0, 10.0], [20.0, 0.0]]) + (400_000.0, 5_500_000.0)
+OUTLINE = np.array([[0.0, 0.0], [0.0, 10.0], [20.0, 10.0], [20.0, 0.0]]) + np.array([400_000.0, 5_500_000.0])
 
 
 def test_layers_geometry_and_values_come_back(tmp_path: Path) -> None:
