@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import field
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 from .errors import OptionError
 
@@ -44,25 +44,30 @@ class CheckedOptions:
         """Check every field against its type and bounds; raises `OptionError`."""
         for item in dataclasses.fields(self):  # type: ignore[arg-type]
             if "help" in item.metadata:
-                _check(type(self), item, getattr(self, item.name))
+                _check(item, getattr(self, item.name))
 
 
-def _check(slice_class: type, item: dataclasses.Field[Any], value: Any) -> None:
-    name = item.name
-    hint = get_type_hints(slice_class)[name]
-    allowed = get_args(hint) or (hint,)
+def allowed_types(item: dataclasses.Field[Any]) -> tuple[str, ...]:
+    """Return the names of the types that an option takes, as in its annotation: `int`, `float`, `bool`, `str`, `None`.
+
+    Annotations are read as text: the Python of the oldest QGIS cannot evaluate `float | None`.
+    """
+    return tuple(str(item.type).split(" | "))
+
+
+def _check(item: dataclasses.Field[Any], value: Any) -> None:
+    name, allowed = item.name, allowed_types(item)
     if value is None:
-        if type(None) not in allowed:
+        if "None" not in allowed:
             raise OptionError(f"{name}: this option requires a value")
         return
     if item.metadata["choices"]:
         if value not in item.metadata["choices"]:
             raise OptionError(f"{name}: {value!r} is not one of {', '.join(item.metadata['choices'])}")
         return
-    numeric_float = float in allowed and isinstance(value, int | float) and not isinstance(value, bool)
-    exact = any(isinstance(a, type) and type(value) is a for a in allowed)
-    if not (numeric_float or exact):
-        raise OptionError(f"{name}: {value!r} is not a {' or '.join(getattr(a, '__name__', str(a)) for a in allowed)}")
+    numeric_float = "float" in allowed and isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not numeric_float and type(value).__name__ not in allowed:
+        raise OptionError(f"{name}: {value!r} is not a {' or '.join(allowed)}")
     if isinstance(value, float) and not math.isfinite(value):
         raise OptionError(f"{name}: {value} is not a finite number")
     low, high = item.metadata["minimum"], item.metadata["maximum"]

@@ -29,7 +29,9 @@ class Extent:
 
     def is_same(self, other: Extent) -> bool:
         """Return whether both are of one cloud, as well as that can be told."""
-        near = (abs(a - b) <= SAME_M for a, b in zip(self.bounds, other.bounds, strict=True))
+        if len(self.bounds) != len(other.bounds):
+            return False
+        near = (abs(a - b) <= SAME_M for a, b in zip(self.bounds, other.bounds))  # noqa: B905 - Python 3.9 of QGIS
         return self.points == other.points and all(near)
 
 
