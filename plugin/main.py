@@ -7,6 +7,7 @@ from pathlib import Path
 from qgis.core import QgsApplication
 from qgis.PyQt.QtCore import QUrl
 from qgis.PyQt.QtGui import QDesktopServices, QGuiApplication, QIcon
+from qgis.PyQt.QtWidgets import QMenu
 
 try:
     from qgis.PyQt.QtGui import QAction
@@ -16,6 +17,7 @@ except ImportError:  # Qt 5
 from ..processing_algorithms.base import tr
 from ..processing_algorithms.provider import OnTheFly3RProvider
 from . import settings
+from .help_page import help_page
 
 MENU = "On-the-Fly3R"
 ICONS = Path(__file__).resolve().parents[1] / "resources" / "icons"
@@ -38,8 +40,11 @@ class OnTheFly3RPlugin:
         """Add provider, menu and toolbar button."""
         self.initProcessing()
         self._add("reconstruct.svg", tr("Reconstruct photographs…"), self.open_reconstruct, toolbar=True)
+        self._add("reconstruct.svg", tr("Try with a sample flight…"), self.open_sample)
         self._add("report.svg", tr("Last report"), self.open_last_report)
+        self._add_recent()
         self._add("setup.svg", tr("Set up processing environment…"), self.open_setup)
+        self._add("onthefly3r.svg", tr("Help"), self.open_help)
         self._add("diagnostics.svg", tr("Copy diagnostics of the last failure"), self.copy_diagnostics)
 
     def unload(self) -> None:
@@ -55,6 +60,14 @@ class OnTheFly3RPlugin:
     def open_reconstruct(self) -> None:
         """Open the main algorithm, or the set-up while there is nothing to compute with."""
         self._open("onthefly3r:reconstruct" if settings.interpreter() else "onthefly3r:setup")
+
+    def open_sample(self) -> None:
+        """Open the sample flight, or the set-up while there is nothing to compute with."""
+        self._open("onthefly3r:sampleflight" if settings.interpreter() else "onthefly3r:setup")
+
+    def open_help(self) -> None:
+        """Open the documentation in the browser."""
+        QDesktopServices.openUrl(QUrl(help_page()))
 
     def open_setup(self) -> None:
         """Open the set-up."""
@@ -78,6 +91,29 @@ class OnTheFly3RPlugin:
         import processing
 
         processing.execAlgorithmDialog(algorithm, {})
+
+    def _add_recent(self) -> None:
+        """Add a menu of the last runs, which is filled when it is opened."""
+        self._recent = QMenu()
+        self._recent.aboutToShow.connect(self.fill_recent)
+        self._add("cameras.svg", tr("Recent runs"), lambda: None)
+        self._actions[-1].setMenu(self._recent)
+
+    def fill_recent(self) -> None:
+        """List the runs that are still there; a click loads one's layers."""
+        self._recent.clear()
+        runs = settings.recent_runs()
+        for run in runs:
+            action = self._recent.addAction(run)
+            action.triggered.connect(lambda checked=False, run=run: self.load_run(run))
+        if not runs:
+            self._recent.addAction(tr("None yet")).setEnabled(False)
+
+    def load_run(self, run: str) -> None:
+        """Load the layers of a run into the project."""
+        import processing
+
+        processing.runAndLoadResults("onthefly3r:loadresults", {"RUN": run})
 
     def _say(self, text: str) -> None:
         self._iface.messageBar().pushMessage(MENU, text)

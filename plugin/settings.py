@@ -5,6 +5,7 @@ The names are those of Processing's own settings, so that the provider's options
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -13,7 +14,10 @@ from qgis.PyQt.QtCore import QStandardPaths
 
 PYTHON = "ONTHEFLY3R_PYTHON"  # the setting and the environment variable that goes before it
 ENVIRONMENT = "ONTHEFLY3R_ENVIRONMENT"
-LAST_REPORT = "onthefly3r/last_report"
+MODELS = "ONTHEFLY3R_WEIGHTS"  # folder of the neural backbones' weights
+CACHE = "ONTHEFLY3R_SCRATCH"  # folder of temporary files
+RECENT = "onthefly3r/recent_runs"
+MOST_RECENT = 10
 DIAGNOSTICS = "onthefly3r/diagnostics"
 _PREFIX = "Processing/Configuration/"
 _STAMP = "onthefly3r-stamp.json"  # written by bootstrap.py when an environment is complete
@@ -56,15 +60,39 @@ def save_interpreter(python: str) -> None:
     _write(PYTHON, python)
 
 
+def default_models_folder() -> str:
+    """Return where weights are looked for when nothing is named."""
+    return str(Path.home() / ".cache" / "onthefly3r")
+
+
+def worker_variables() -> dict[str, str]:
+    """Return the variables by which the worker learns the folders of weights and of temporary files."""
+    models, cache = _read(MODELS), _read(CACHE)
+    variables = {MODELS: models} if models else {}
+    if cache and Path(cache).is_dir():
+        variables.update(TMPDIR=cache, TEMP=cache, TMP=cache)
+    return variables
+
+
+def recent_runs() -> list[str]:
+    """Return the folders of the last runs that are still there, the latest first."""
+    try:
+        told = json.loads(str(QgsSettings().value(RECENT, "") or "[]"))
+        return [run for run in told if isinstance(run, str) and (Path(run) / "report.json").is_file()]
+    except (ValueError, TypeError):
+        return []
+
+
+def save_run(folder: str) -> None:
+    """Remember the folder of the last run."""
+    others = [run for run in recent_runs() if run != folder]
+    QgsSettings().setValue(RECENT, json.dumps([folder, *others][:MOST_RECENT]))
+
+
 def last_report() -> str:
     """Return the page of the last run, empty when there is none any more."""
-    path = str(QgsSettings().value(LAST_REPORT, "") or "")
-    return path if path and Path(path).is_file() else ""
-
-
-def save_last_report(path: str) -> None:
-    """Remember the page of the last run."""
-    QgsSettings().setValue(LAST_REPORT, path)
+    pages = (Path(run) / "report.html" for run in recent_runs()[:1])
+    return next((str(page) for page in pages if page.is_file()), "")
 
 
 def diagnostics() -> str:

@@ -5,9 +5,11 @@ Standard library and the core's light modules only; QGIS hands in its feedback a
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import tempfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -46,8 +48,11 @@ class Listener(Protocol):
         """Take a line that is no event."""
 
 
-def run_job(python: str, job: Job, listener: Listener) -> dict[str, Any]:
-    """Run one job to its end and return the data of its result; raises `WorkerError` and `WorkerCancelled`."""
+def run_job(python: str, job: Job, listener: Listener, variables: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Run one job to its end and return the data of its result; raises `WorkerError` and `WorkerCancelled`.
+
+    `variables` are set for the worker beside what the environment has.
+    """
     require_interpreter(python)
     told: dict[str, Any] = {}
 
@@ -67,7 +72,7 @@ def run_job(python: str, job: Job, listener: Listener) -> dict[str, Any]:
         job.write(job_file)
         command = [python, "-m", "onthefly3r", "job", str(job_file)]
         try:
-            ended = stream(command, worker_environ(), take, listener.is_cancelled)
+            ended = stream(command, worker_environ(variables), take, listener.is_cancelled)
         except OSError as error:
             raise _failure(f"{python} cannot be started ({error.strerror}): {SETUP}.", command, None, "") from error
     if ended.cancelled:
@@ -78,9 +83,23 @@ def run_job(python: str, job: Job, listener: Listener) -> dict[str, Any]:
     raise _failure(message, [*command, *job.words()], ended.returncode, ended.error_text)
 
 
-def worker_environ() -> dict[str, str]:
-    """Return the variables for the core: its own source first, nothing of QGIS."""
-    return clean_environ(os.environ, PLUGIN_FOLDER / "core")
+def worker_environ(more: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Return the variables for the core: its own source first, nothing of QGIS, and `more`."""
+    return {**clean_environ(os.environ, PLUGIN_FOLDER / "core"), **(more or {})}
+
+
+def describe_backbones(
+    python: str, is_cancelled: Callable[[], bool], variables: Mapping[str, str] | None = None
+) -> list[dict[str, Any]]:
+    """Return what `onthefly3r backbones` says of each one; empty where it says nothing."""
+    lines: list[str] = []
+    command = [python, "-m", "onthefly3r", "backbones", "--json"]
+    try:
+        stream(command, worker_environ(variables), lines.append, is_cancelled)
+        described = json.loads("\n".join(lines))["backbones"]
+        return [item for item in described if {"name", "installed", "weights", "next_step"} <= set(item)]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []  # the run itself says why
 
 
 def require_interpreter(python: str) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import html
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from qgis.core import (
     QgsProcessingContext,
     QgsProcessingException,
     QgsProcessingFeedback,
+    QgsProcessingParameterEnum,
 )
 from qgis.PyQt.QtCore import QCoreApplication
 from qgis.PyQt.QtGui import QIcon
@@ -18,6 +20,8 @@ from qgis.PyQt.QtGui import QIcon
 from ..core.onthefly3r.protocol import Event, Job
 from ..plugin import settings
 from ..plugin.explain import NO_INTERPRETER
+from ..plugin.help_page import help_page
+from ..plugin.timeleft import TimeLeft
 from ..plugin.worker import WorkerCancelled, WorkerError, run_job
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -35,6 +39,12 @@ RUN_STAGES: Stages = {
     "collecting points": (85, 90),
     "fusing the cloud": (90, 99),
 }
+# What people look for who do not know the name.
+TAGS = (
+    "uav", "drone", "uas", "rpas", "aerial", "photogrammetry", "sfm", "structure from motion", "mvs", "odm", "lidar",
+    "las", "laz", "copc", "point cloud", "orthophoto", "orthomosaic", "dem", "dsm", "dtm", "camera", "gps", "rtk",
+    "ground control", "gcp", "colmap", "photographs", "images", "3d",
+)  # fmt: skip
 EXPORT_STAGES: Stages = {"collecting points": (0, 50), "fusing the cloud": (50, 99)}
 
 
@@ -50,6 +60,8 @@ class FeedbackListener:
         self._feedback = feedback
         self._stages = stages
         self._stage = ""
+        self._time_left = TimeLeft()
+        self.told: set[str] = set()  # warnings, each of which is told once
 
     def is_cancelled(self) -> bool:
         """Return whether the user cancelled."""
@@ -58,9 +70,15 @@ class FeedbackListener:
     def event(self, event: Event) -> None:
         """Show a progress report or a warning."""
         if event.kind == "warning":
-            self._feedback.pushWarning(str(event.data.get("message", "")))
+            self.warn(str(event.data.get("message", "")))
         elif event.kind == "progress":
             self._progress(event.data)
+
+    def warn(self, message: str) -> None:
+        """Show a warning, once."""
+        if message and message not in self.told:
+            self.told.add(message)
+            self._feedback.pushWarning(message)
 
     def line(self, text: str) -> None:
         """Show a line that is no event."""
@@ -69,12 +87,16 @@ class FeedbackListener:
     def _progress(self, data: dict[str, Any]) -> None:
         stage, done, total = str(data.get("stage", "")), data.get("done", 0), data.get("total", 0)
         begin, end = self._stages.get(stage, (0, 100))
+        left = ""
         if total:
-            self._feedback.setProgress(begin + (end - begin) * min(1.0, done / total))
+            percent = begin + (end - begin) * min(1.0, done / total)
+            left = self._time_left.text(percent / 100.0)
+            self._feedback.setProgress(percent)
         counts = [(data.get("placed"), tr("placed")), (data.get("rejected"), tr("rejected"))]
         counts_text = ", ".join(f"{count} {word}" for count, word in counts if count)
         text = f"{stage}: {data['message']}" if data.get("message") else f"{stage} {done}/{total}"
-        self._feedback.setProgressText(text + (f" ({counts_text})" if counts_text else ""))
+        text += f" ({counts_text})" if counts_text else ""
+        self._feedback.setProgressText(f"{text}; {left}" if left else text)
         if stage != self._stage:
             self._stage = stage
             self._feedback.pushInfo(stage)
@@ -90,6 +112,10 @@ class CoreAlgorithm(QgsProcessingAlgorithm):
     STAGES: Stages = RUN_STAGES
     needs_environment = True
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.warned: set[str] = set()
+
     def createInstance(self) -> CoreAlgorithm:
         """Return a fresh instance."""
         return type(self)()
@@ -103,8 +129,8 @@ class CoreAlgorithm(QgsProcessingAlgorithm):
         return tr(self.TITLE)
 
     def shortHelpString(self) -> str:
-        """Return what the algorithm does."""
-        return tr(self.HELP)
+        """Return what the algorithm does, as HTML."""
+        return "".join(f"<p>{html.escape(part, quote=False)}</p>" for part in tr(self.HELP).split("\n\n"))
 
     def shortDescription(self) -> str:
         """Return the first sentence of the help, for tool tips."""
@@ -120,7 +146,11 @@ class CoreAlgorithm(QgsProcessingAlgorithm):
 
     def helpUrl(self) -> str:
         """Return the page of the documentation that travels with the plugin."""
-        return (ROOT / "docs" / "qgis.md").as_uri()
+        return help_page()
+
+    def tags(self) -> list[str]:
+        """Return words that find the algorithm in the toolbox."""
+        return list(TAGS)
 
     def canExecute(self) -> tuple[bool, str]:
         """Return whether there is an interpreter for the core, and what to do when there is none."""
@@ -135,14 +165,21 @@ class CoreAlgorithm(QgsProcessingAlgorithm):
         """Return whether the parameters will do, and what is wrong with them."""
         try:
             self.check(parameters, context)
+            words = {
+                definition.name(): chosen_word(self, parameters, context, definition.name())
+                for definition in self.parameterDefinitions()
+                if isinstance(definition, QgsProcessingParameterEnum) and definition.name() in parameters
+            }
         except QgsProcessingException as error:
             return False, str(error)
-        return super().checkParameterValues(parameters, context)
+        return super().checkParameterValues({**parameters, **words}, context)
 
     def run_core(self, job: Job, feedback: QgsProcessingFeedback) -> dict[str, Any]:
         """Run a job and return the data of its result; raises `QgsProcessingException` with the remedy."""
+        listener = FeedbackListener(feedback, self.STAGES)
+        self.warned = listener.told
         try:
-            return run_job(settings.interpreter(), job, FeedbackListener(feedback, self.STAGES))
+            return run_job(settings.interpreter(), job, listener, settings.worker_variables())
         except WorkerCancelled:
             raise QgsProcessingException(tr("Cancelled: the worker and all that it started have ended.")) from None
         except WorkerError as error:
@@ -150,3 +187,33 @@ class CoreAlgorithm(QgsProcessingAlgorithm):
                 settings.save_diagnostics(error.diagnostics)
                 feedback.pushConsoleInfo(error.diagnostics)
             raise QgsProcessingException(str(error)) from None
+
+    def warn(self, messages: Iterable[str], feedback: QgsProcessingFeedback) -> None:
+        """Show warnings of a result that the worker has not told while it ran, each once."""
+        for message in messages:
+            if message not in self.warned:
+                self.warned.add(message)
+                feedback.pushWarning(message)
+
+
+def chosen_word(
+    algorithm: QgsProcessingAlgorithm, parameters: Mapping[str, Any], context: QgsProcessingContext, name: str
+) -> str:
+    """Return the word that a choice means: the word itself in any case, or its number; raises for anything else."""
+    definition = algorithm.parameterDefinition(name)
+    words, given = list(definition.options()), parameters.get(name)
+    if given is None or given == "":
+        given = definition.defaultValue()
+    if not isinstance(given, (str, int)) or isinstance(given, bool):  # a property of a model or of a batch
+        given = algorithm.parameterAsEnumString(dict(parameters), name, context)
+    text = str(given).strip()
+    found = next((word for word in words if word.lower() == text.lower()), None)
+    if found is None and text.isascii() and text.isdigit() and int(text) < len(words):
+        found = words[int(text)]
+    if found is None:
+        raise QgsProcessingException(
+            tr("{}: {} is none of {} (or their numbers, 0 to {}).").format(
+                definition.description(), text, ", ".join(words), len(words) - 1
+            )
+        )
+    return found

@@ -50,12 +50,10 @@ def boundary_file(
     algorithm: QgsProcessingAlgorithm, parameters: dict[str, Any], context: QgsProcessingContext
 ) -> Iterator[str | None]:
     """Yield the path of a GeoJSON file (WGS 84) of what the cloud is cut to, None when it is not cut."""
-    area = _area(algorithm, parameters, context)
+    area = area_of(algorithm, parameters, context)
     if area is None:
         yield None
         return
-    if area.isEmpty():
-        raise QgsProcessingException(tr("The boundary holds no ground: no polygons, or none in the extent."))
     with tempfile.TemporaryDirectory(prefix="onthefly3r-") as folder:
         path = Path(folder) / "boundary.geojson"
         feature = {"type": "Feature", "properties": {}, "geometry": json.loads(area.asJson(12))}
@@ -63,13 +61,29 @@ def boundary_file(
         yield str(path)
 
 
-def _area(
+def area_of(
     algorithm: QgsProcessingAlgorithm, parameters: dict[str, Any], context: QgsProcessingContext
 ) -> QgsGeometry | None:
-    """Return boundary and extent as one geometry in longitude and latitude."""
+    """Return boundary and extent as one geometry in longitude and latitude, None where neither is named.
+
+    Raises `QgsProcessingException` for what is no area.
+    """
+    area = _named_area(algorithm, parameters, context)
+    if area is not None and area.isEmpty():
+        raise QgsProcessingException(tr("The boundary holds no ground: no polygons, or none in the extent."))
+    return area
+
+
+def _named_area(
+    algorithm: QgsProcessingAlgorithm, parameters: dict[str, Any], context: QgsProcessingContext
+) -> QgsGeometry | None:
     wgs84 = QgsCoordinateReferenceSystem("EPSG:4326")
     area = None
     source = algorithm.parameterAsSource(parameters, BOUNDARY, context)
+    if source is None and parameters.get(BOUNDARY) not in (None, ""):
+        raise QgsProcessingException(
+            tr("The boundary layer {} cannot be read, or is no layer of polygons.").format(parameters[BOUNDARY])
+        )
     if source is not None:
         if not source.sourceCrs().isValid():
             raise QgsProcessingException(tr("The boundary layer has no coordinate reference system: set it first."))
@@ -77,6 +91,10 @@ def _area(
         area = QgsGeometry.unaryUnion([feature.geometry() for feature in source.getFeatures(request)])
     if parameters.get(EXTENT) not in (None, ""):
         crs = algorithm.parameterAsExtentCrs(parameters, EXTENT, context)
+        if algorithm.parameterAsExtent(parameters, EXTENT, context).isNull():
+            raise QgsProcessingException(
+                tr("{} is no extent: write it as xmin,xmax,ymin,ymax [EPSG:32633].").format(parameters[EXTENT])
+            )
         if not crs.isValid():
             raise QgsProcessingException(
                 tr("The extent has no coordinate reference system: add it, as in [EPSG:32633].")

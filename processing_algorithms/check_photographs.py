@@ -23,11 +23,13 @@ from qgis.core import (
 )
 
 from ..core.onthefly3r.protocol import Job
+from ..plugin.places import survey_name
 from .base import CoreAlgorithm, tr
 from .layers import FOOTPRINT_FIELDS, FOOTPRINTS, REAL, TEXT, WHOLE, Row, fill_sink
-from .parameters import add, add_georeference, add_quality, options_from, require_folder
+from .parameters import add, add_georeference, add_quality, options_from
 from .presentation import show
-from .reconstruct import PHOTOS, add_photographs
+from .reconstruct import add_photographs, photographs
+from .survey import HEIGHTS
 
 CHECKED, ABOVE_GROUND = "CHECKED", "ABOVE_GROUND_M"
 
@@ -37,7 +39,7 @@ CHECKED_FIELDS = (
     ("overlap", WHOLE),
     *((name, REAL) for name in ("best_overlap", "covered", "sharpness", "dark", "bright", "contrast")),
     *((name, WHOLE) for name in ("width_px", "height_px")),
-    *((name, TEXT) for name in ("camera", "focal_source")),
+    *((name, TEXT) for name in ("camera", "focal_source", "path")),
 )
 EXPECTED_FIELDS = tuple(field for field in FOOTPRINT_FIELDS if field[0] != "number")  # a run gives the numbers
 NUMBERS = {
@@ -103,14 +105,14 @@ class CheckPhotographs(CoreAlgorithm):
 
     def check(self, parameters: dict[str, Any], context: QgsProcessingContext) -> None:
         """Tell wrong folders before anything starts."""
-        require_folder(self.parameterAsString(parameters, PHOTOS, context), tr("Folder of photographs"))
+        photographs(self, parameters, context)
         options_from(self, parameters, context)
 
     def processAlgorithm(
         self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback
     ) -> dict[str, Any]:
         """Run the check and show its rows."""
-        photos = require_folder(self.parameterAsString(parameters, PHOTOS, context), tr("Folder of photographs"))
+        photos = photographs(self, parameters, context)
         options = options_from(self, parameters, context)
         if parameters.get(ABOVE_GROUND) not in (None, ""):
             options["above_ground_m"] = self.parameterAsDouble(parameters, ABOVE_GROUND, context)
@@ -123,7 +125,7 @@ class CheckPhotographs(CoreAlgorithm):
         results["WARNINGS"] = "\n".join(summary["warnings"])
         crs = QgsCoordinateReferenceSystem(summary["crs"] or "")
         sinks = (
-            (CHECKED, CHECKED_FIELDS, QgsWkbTypes.Type.PointZ, map(point_row, rows), "checked.qml"),
+            (CHECKED, CHECKED_FIELDS, QgsWkbTypes.Type.PointZ, (point_row(row, photos) for row in rows), "checked.qml"),
             (
                 FOOTPRINTS,
                 EXPECTED_FIELDS,
@@ -135,7 +137,8 @@ class CheckPhotographs(CoreAlgorithm):
         for name, fields, geometry, features, style in sinks:
             if parameters.get(name) not in (None, ""):
                 results[name] = fill_sink(self, parameters, context, name, fields, geometry, crs, features)
-                show(context, results[name], tr("{}, checked").format(photos.name), style)
+                group = tr("{}, checked").format(survey_name(photos))
+                show(context, results[name], group, style, HEIGHTS.get(name.lower(), HEIGHTS["cameras"]))
         return results
 
     def _say(self, summary: dict[str, Any], feedback: QgsProcessingFeedback) -> None:
@@ -149,10 +152,10 @@ class CheckPhotographs(CoreAlgorithm):
             )
 
 
-def point_row(row: dict[str, Any]) -> Row:
+def point_row(row: dict[str, Any], photos: Path) -> Row:
     """Return the attributes and the place of a checked photograph."""
     place = None if row["x"] is None else QgsGeometry(QgsPoint(row["x"], row["y"], row["height_m"] or 0.0))
-    return {**row, "problems": "; ".join(row["problems"])}, place
+    return {**row, "problems": "; ".join(row["problems"]), "path": str(photos.absolute() / row["image"])}, place
 
 
 def polygon_row(row: dict[str, Any]) -> Row:

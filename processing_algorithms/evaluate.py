@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from qgis.core import (
@@ -19,10 +18,10 @@ from qgis.core import (
 )
 
 from ..core.onthefly3r.protocol import Job
-from .base import tr
+from .base import chosen_word, tr
 from .earlier_run import EarlierRunAlgorithm
 from .layers import REAL, TEXT, fill_sink
-from .parameters import add, words_parameter
+from .parameters import add, require_file, require_folder, words_parameter
 from .presentation import show
 
 POSES, POSES_FOLDER, CLOUD, ALIGN, CLOUD_ALIGN, ICP, TABLE = (
@@ -129,8 +128,8 @@ class Evaluate(EarlierRunAlgorithm):
         run = self.run_folder(parameters, context)
         options = {
             **self._references(parameters, context),
-            "align": self.parameterAsEnumString(parameters, ALIGN, context),
-            "cloud_align": self.parameterAsEnumString(parameters, CLOUD_ALIGN, context),
+            "align": chosen_word(self, parameters, context, ALIGN),
+            "cloud_align": chosen_word(self, parameters, context, CLOUD_ALIGN),
         }
         if self.parameterAsBoolean(parameters, ICP, context):
             options["icp"] = True
@@ -162,7 +161,11 @@ class Evaluate(EarlierRunAlgorithm):
         if not (file or folder or cloud):
             raise QgsProcessingException(tr("Give reference cameras, a reference cloud, or both."))
         named = {"reference_poses": file or folder, "reference_cloud": cloud}
-        for path in filter(None, named.values()):
-            if not Path(path).exists():
-                raise QgsProcessingException(tr("{} does not exist.").format(path))
+        for given, title, require in (
+            (file, tr("Reference cameras, file"), require_file),
+            (folder, tr("Reference cameras, folder"), require_folder),
+            (cloud, tr("Reference cloud"), require_file),
+        ):
+            if given:
+                require(given, title)
         return {name: path for name, path in named.items() if path}

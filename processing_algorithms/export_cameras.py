@@ -17,6 +17,7 @@ from .base import tr
 from .earlier_run import EarlierRunAlgorithm
 from .layers import add_camera_sinks, fill_camera_sinks, read_report, run_crs
 from .parameters import CRS, add_target_crs, options_from
+from .survey import photographs_folder
 
 
 class ExportCameras(EarlierRunAlgorithm):
@@ -40,20 +41,25 @@ class ExportCameras(EarlierRunAlgorithm):
         self.addOutput(QgsProcessingOutputNumber("PLACED", tr("Photographs placed")))
         self.addOutput(QgsProcessingOutputNumber("GIVEN", tr("Photographs given")))
 
+    def check(self, parameters: dict[str, Any], context: QgsProcessingContext) -> None:
+        """Tell what is wrong before anything starts."""
+        options_from(self, parameters, context)
+        super().check(parameters, context)
+
     def processAlgorithm(
         self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback
     ) -> dict[str, Any]:
         """Fill the layers from the run, or from an export in another CRS."""
         run = self.run_folder(parameters, context)
         report = read_report(run / "report.json")
-        wanted = self.parameterAsCrs(parameters, CRS, context)
+        wanted, photos = self.parameterAsCrs(parameters, CRS, context), photographs_folder(run)
         if not wanted.isValid() or wanted == run_crs(report):
-            layers = fill_camera_sinks(self, parameters, context, feedback, run, run.name)
+            layers = fill_camera_sinks(self, parameters, context, feedback, run, photos)
         elif report["georeference"] is None:
             raise QgsProcessingException(tr("The run is in map units: georeference it first."))
         else:
             options = options_from(self, parameters, context)
             with tempfile.TemporaryDirectory(prefix="onthefly3r-") as scratch:
                 self.export(run, Path(scratch), {**options, "cloud": False}, feedback)
-                layers = fill_camera_sinks(self, parameters, context, feedback, Path(scratch), run.name)
+                layers = fill_camera_sinks(self, parameters, context, feedback, Path(scratch), photos)
         return {**layers, "PLACED": report["images"]["placed"], "GIVEN": report["images"]["given"]}

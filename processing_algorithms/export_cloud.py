@@ -18,10 +18,11 @@ from qgis.core import (
 
 from ..core.onthefly3r.files.las_index import indexes_beside, indexes_of
 from .base import tr
-from .boundary import add_boundary, boundary_file
+from .boundary import add_boundary, area_of, boundary_file
 from .earlier_run import EarlierRunAlgorithm, scratch_folder
 from .parameters import add, add_options, add_target_crs, options_from
 from .presentation import show
+from .survey import HEIGHTS, photographs_folder, survey_title
 
 OUTPUT = "OUTPUT"
 FORMATS = ("laz", "las")
@@ -65,6 +66,8 @@ class ExportCloud(EarlierRunAlgorithm):
     def check(self, parameters: dict[str, Any], context: QgsProcessingContext) -> None:
         """Tell wrong endings before anything starts."""
         super().check(parameters, context)
+        options_from(self, parameters, context)
+        area_of(self, parameters, context)
         path = self.parameterAsFileOutput(parameters, OUTPUT, context)
         if _format(path) not in FORMATS:
             raise QgsProcessingException(tr("{} ends neither in .laz nor in .las.").format(path))
@@ -96,7 +99,7 @@ class ExportCloud(EarlierRunAlgorithm):
                 feedback.pushWarning(
                     tr("{} is not of this cloud: QGIS may show it instead; move it away.").format(foreign.path)
                 )
-        show(context, str(out), run.name, "cloud")
+        show(context, str(out), survey_title(run, photographs_folder(run)), "cloud", HEIGHTS["cloud"])
         cloud, geo = report["cloud"], report["georeference"] or {}
         return {
             OUTPUT: str(out),

@@ -9,15 +9,14 @@ from qgis.core import (
     QgsProcessingContext,
     QgsProcessingException,
     QgsProcessingFeedback,
-    QgsProcessingParameterFolderDestination,
 )
 
 from .base import tr
 from .earlier_run import EarlierRunAlgorithm
-from .parameters import add, add_georeference, add_options, options_from
+from .output import OUTPUT, add_output, output_folder
+from .parameters import add_control, add_georeference, add_options, options_from
 from .results import add_run_outputs, hand_over
-
-OUTPUT = "OUTPUT"
+from .survey import photographs_folder
 
 
 class Georeference(EarlierRunAlgorithm):
@@ -36,11 +35,14 @@ class Georeference(EarlierRunAlgorithm):
         """Declare parameters and outputs."""
         self.add_run()
         add_georeference(self, again=True)
+        add_control(self)
         add_options(self, "gps_sigma_h_m", "gps_sigma_v_m", "local", "format")
-        add(
+        add_output(
             self,
-            QgsProcessingParameterFolderDestination(OUTPUT, tr("Output folder")),
-            tr("Another folder than that of the run. It holds no map: use the first run's folder to georeference it."),
+            tr(
+                "Another folder than that of the run; left empty, a new one beside it. It holds no map: use the first "
+                "run's folder to georeference it again."
+            ),
         )
         add_run_outputs(self)
 
@@ -48,14 +50,17 @@ class Georeference(EarlierRunAlgorithm):
         """Tell what is wrong before anything starts."""
         options_from(self, parameters, context)
         run = self.run_folder(parameters, context)
-        if Path(self.parameterAsString(parameters, OUTPUT, context)).resolve() == run.resolve():
+        named = self.parameterAsString(parameters, OUTPUT, context).strip()
+        if named and Path(named).resolve() == run.resolve():
             raise QgsProcessingException(tr("The output folder is that of the run: name another one."))
+        output_folder(self, parameters, context, run)
 
     def processAlgorithm(
         self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback
     ) -> dict[str, Any]:
         """Write everything again, then fill the layers."""
-        out = Path(self.parameterAsString(parameters, OUTPUT, context))
+        run = self.run_folder(parameters, context)
+        out = output_folder(self, parameters, context, run)
         options = options_from(self, parameters, context, every=True)
-        self.export(self.run_folder(parameters, context), out, options, feedback)
-        return {OUTPUT: str(out), **hand_over(self, parameters, context, feedback, out)}
+        self.export(run, out, options, feedback)
+        return {OUTPUT: str(out), **hand_over(self, parameters, context, feedback, out, photographs_folder(run))}

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from qgis.core import (
-    Qgis,
     QgsCoordinateReferenceSystem,
     QgsFeature,
     QgsFeatureSink,
@@ -24,20 +23,17 @@ from qgis.core import (
     QgsVectorLayer,
     QgsWkbTypes,
 )
-from qgis.PyQt.QtCore import QMetaType, QVariant
+from qgis.PyQt.QtCore import QVariant
 
 from .base import tr
+from .field_types import REAL, TEXT, TRUTH, WHOLE
 from .parameters import add
 from .presentation import show
+from .survey import HEIGHTS, survey_title, table_uri
 
 CAMERAS, REJECTED, FOOTPRINTS = "CAMERAS", "REJECTED", "FOOTPRINTS"
 MAX_REPORT_BYTES = 64 * 1024 * 1024
 
-if Qgis.QGIS_VERSION_INT >= 33800:
-    TEXT, REAL = QMetaType.Type.QString, QMetaType.Type.Double
-    WHOLE, TRUTH = QMetaType.Type.Int, QMetaType.Type.Bool
-else:  # fields do not take QMetaType yet
-    TEXT, REAL, WHOLE, TRUTH = QVariant.String, QVariant.Double, QVariant.Int, QVariant.Bool
 CAMERA_FIELDS = (
     ("image", TEXT),
     ("number", WHOLE),
@@ -51,6 +47,7 @@ CAMERA_FIELDS = (
     ("batch", WHOLE),
     ("t_utc", TEXT),
     ("cam", TEXT),
+    ("path", TEXT),
 )
 REJECTED_FIELDS = (
     *((name, TEXT) for name in ("image", "stage", "reason")),
@@ -58,6 +55,7 @@ REJECTED_FIELDS = (
     ("retries", WHOLE),
     ("t_utc", TEXT),
     ("cam", TEXT),
+    ("path", TEXT),
 )
 FOOTPRINT_FIELDS = (("image", TEXT), ("number", WHOLE), ("gsd_m", REAL), ("area_m2", REAL), ("overlap", WHOLE))
 
@@ -72,24 +70,31 @@ def make_fields(described: Iterable[tuple[str, Any]]) -> QgsFields:
     return fields
 
 
-def add_camera_sinks(algorithm: QgsProcessingAlgorithm) -> None:
-    """Add the layers that every run has."""
+def add_camera_sinks(algorithm: QgsProcessingAlgorithm, by_default: bool = True) -> None:
+    """Add the layers that every run has; `by_default` makes them where the dialog is left as it is."""
     point, polygon = QgsProcessing.SourceType.TypeVectorPoint, QgsProcessing.SourceType.TypeVectorPolygon
     add(
         algorithm,
-        QgsProcessingParameterFeatureSink(CAMERAS, tr("Cameras"), point, optional=True),
+        _sink(CAMERAS, tr("Cameras"), point, by_default),
         tr("Where each placed photograph was taken, its angles, and how far its tagged position is from there."),
+        advanced=not by_default,
     )
     add(
         algorithm,
-        QgsProcessingParameterFeatureSink(REJECTED, tr("Rejected photographs"), point, optional=True),
+        _sink(REJECTED, tr("Rejected photographs"), point, by_default),
         tr("What could not be used, with the reason; at the tagged position, or without geometry where there is none."),
+        advanced=not by_default,
     )
     add(
         algorithm,
-        QgsProcessingParameterFeatureSink(FOOTPRINTS, tr("Footprints"), polygon, optional=True),
+        _sink(FOOTPRINTS, tr("Footprints"), polygon, by_default),
         tr("The ground that each placed photograph covers, and how many photographs cover its middle."),
+        advanced=not by_default,
     )
+
+
+def _sink(name: str, title: str, kind: Any, by_default: bool) -> QgsProcessingParameterFeatureSink:
+    return QgsProcessingParameterFeatureSink(name, title, kind, None, True, by_default)
 
 
 def read_report(path: Path) -> dict[str, Any]:
@@ -110,20 +115,23 @@ def fill_camera_sinks(
     context: QgsProcessingContext,
     feedback: QgsProcessingFeedback,
     run: Path,
-    group: str,
+    photos: Path | None,
 ) -> dict[str, Any]:
     """Fill the sinks of `add_camera_sinks` from the files of a run and return their destinations.
 
-    Layers that QGIS loads come into the group.
+    Layers that QGIS loads come into the group of the survey; `photos` is the folder of its photographs, if known.
     """
     report = read_report(run / "report.json")
     crs = run_crs(report)
     cameras = list(read_rows(run / "cameras.shp", CAMERA_FIELDS))
     placed = [row for row in cameras if row[0]["status"] == "placed"]
-    footprints = list(read_rows(run / "footprints.shp", FOOTPRINT_FIELDS))
+    footprints = list(read_footprints(run))
+    rejected = rejected_rows(report, cameras)
+    for values, _ in (*cameras, *rejected) if photos is not None else ():
+        values["path"] = str(photos.absolute() / values["image"])
     sinks = (
         (CAMERAS, CAMERA_FIELDS, QgsWkbTypes.Type.PointZ, placed, "cameras.qml"),
-        (REJECTED, REJECTED_FIELDS, QgsWkbTypes.Type.PointZ, rejected_rows(report, cameras), "rejected.qml"),
+        (REJECTED, REJECTED_FIELDS, QgsWkbTypes.Type.PointZ, rejected, "rejected.qml"),
         (FOOTPRINTS, FOOTPRINT_FIELDS, QgsWkbTypes.Type.Polygon, footprints, "footprints.qml"),
     )
     results: dict[str, Any] = {}
@@ -131,7 +139,7 @@ def fill_camera_sinks(
         if parameters.get(name) in (None, ""):
             continue
         results[name] = fill_sink(algorithm, parameters, context, name, fields, geometry, crs, rows)
-        show(context, results[name], group, style)
+        show(context, results[name], survey_title(run, photos), style, HEIGHTS[name.lower()])
         feedback.pushInfo(f"{algorithm.parameterDefinition(name).description()}: {len(rows)}")
     return results
 
@@ -171,13 +179,18 @@ def run_crs(report: dict[str, Any]) -> QgsCoordinateReferenceSystem:
     return crs
 
 
-def read_rows(path: Path, described: Iterable[tuple[str, Any]]) -> Iterable[Row]:
-    """Yield attributes and geometry of a shapefile's features, nothing where it is missing."""
-    if not path.is_file():
+def read_footprints(run: Path) -> Iterable[Row]:
+    """Yield the footprints of a run."""
+    return read_rows(table_uri(run, "footprints"), FOOTPRINT_FIELDS)
+
+
+def read_rows(uri: Path | str, described: Iterable[tuple[str, Any]]) -> Iterable[Row]:
+    """Yield attributes and geometry of a table's features, nothing where it is missing."""
+    if not uri or not Path(str(uri).partition("|")[0]).is_file():
         return
-    layer = QgsVectorLayer(str(path), path.stem, "ogr")
+    layer = QgsVectorLayer(str(uri), "rows", "ogr")
     if not layer.isValid():
-        raise QgsProcessingException(tr("{} cannot be read.").format(path))
+        raise QgsProcessingException(tr("{} cannot be read.").format(uri))
     convert: dict[Any, Callable[[Any], Any]] = {TEXT: str, REAL: float, WHOLE: int, TRUTH: _truth}
     kinds = dict(described)
     known = [field.name() for field in layer.fields()]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from qgis.core import (
     QgsCoordinateReferenceSystem,
@@ -19,36 +19,32 @@ from qgis.core import (
     QgsProcessingParameterFile,
     QgsProcessingParameterNumber,
     QgsProcessingParameterString,
+    QgsUnitTypes,
 )
 
-from ..core.onthefly3r.options import Preset, iterate_options
-from .base import tr
+from ..core.onthefly3r.errors import OptionError
+from ..core.onthefly3r.options import Options, iterate_options
+from .base import chosen_word, tr
+from .option_text import read_options
 
 # Names of the parameters that are not options of the core.
-QUALITY, CRS, POSITIONS, PRESET = "QUALITY", "CRS", "POSITIONS", "PRESET"
+QUALITY, CRS, OPTIONS = "QUALITY", "CRS", "OPTIONS"
+# Those of options that name a file of the user.
+FILES = ("POSITIONS", "CONTROL")
 
-# The presets set these; whoever names one of them in the advanced parameters overrides the preset.
+# The presets set these; whoever names one of them among the further options overrides the preset.
 QUALITIES: dict[str, dict[str, int]] = {
     "preview": {"working_px": 600, "dense_px": 250, "features": 2000},
     "standard": {},
     "full": {"working_px": 1600, "dense_px": 1000, "features": 8000},
 }
-# With parameters of their own, or of no use in QGIS.
-NOT_SHOWN = {"crs", "boundary", "backbone", "vertical", "positions", "cloud"}
 AS_BEFORE = "as before"
 UNITS = ("m", "px", "mm", "deg", "GiB")  # shown in titles; the others only say what is counted
 # Titles where the option's name alone says too little to somebody who does not know the command line.
 TITLES = {
-    "recursive": "Search sub-folders too",
-    "min_side_px": "Shortest side allowed",
-    "limit": "Use only the first photographs",
-    "focal_35mm": "Focal length, 35-mm equivalent",
-    "working_px": "Size of the photographs while reconstructing",
-    "dense_px": "Size of the point maps",
-    "threads": "Processor cores",
-    "local": "Map units, no coordinate reference system",
     "gps_sigma_h_m": "Accuracy of positions, horizontal",
     "gps_sigma_v_m": "Accuracy of positions, vertical",
+    "local": "Map units, no coordinate reference system",
     "format": "Format of the point cloud",
     "spacing_m": "Distance of points",
     "min_confidence": "Least confidence of a point, 0 to 1",
@@ -119,7 +115,7 @@ def add_georeference(algorithm: QgsProcessingAlgorithm, again: bool = False) -> 
     add(
         algorithm,
         QgsProcessingParameterFile(
-            POSITIONS, tr("Position file"), QgsProcessingParameterFile.Behavior.File, optional=True
+            "POSITIONS", tr("Position file"), QgsProcessingParameterFile.Behavior.File, optional=True
         ),
         tr(
             "A text file (geo.txt) that replaces the positions in the photographs: first a line with the CRS, such as "
@@ -129,17 +125,31 @@ def add_georeference(algorithm: QgsProcessingAlgorithm, again: bool = False) -> 
     )
 
 
-def add_all_options(algorithm: QgsProcessingAlgorithm) -> None:
-    """Add the core's options that have no parameter of their own, as advanced ones; empty means the core's default."""
+def add_control(algorithm: QgsProcessingAlgorithm) -> None:
+    """Add the file of ground control."""
     add(
         algorithm,
-        words_parameter(PRESET, tr("Defaults"), get_args(Preset), "default"),
-        tr("Whose defaults are taken where nothing is named: ours, or those of the paper that the method is from."),
+        QgsProcessingParameterFile(
+            "CONTROL", tr("Ground control"), QgsProcessingParameterFile.Behavior.File, optional=True
+        ),
+        tr(
+            "Points that were surveyed on the ground and marked in the photographs: gcp_list.txt, a CSV with the "
+            "columns label, x, y, z, image, px, py, or GeoJSON. Labels that begin with CHK- only check the result."
+        ),
+    )
+
+
+def add_further_options(algorithm: QgsProcessingAlgorithm) -> None:
+    """Add one text for all options of the core that have no parameter of their own."""
+    add(
+        algorithm,
+        QgsProcessingParameterString(OPTIONS, tr("Further options"), multiLine=True, optional=True),
+        tr(
+            "name=value, a line each, as on the command line; for instance threads=2, spacing_m=0.1, recursive=no, "
+            "preset=paper. Or the path of a text file with such lines. docs/options.md explains all of them."
+        ),
         advanced=True,
     )
-    for _, item in iterate_options():
-        if item.name not in NOT_SHOWN:
-            add(algorithm, option_parameter(item), option_help(item), advanced=True)
 
 
 def add_options(algorithm: QgsProcessingAlgorithm, *names: str) -> None:
@@ -202,31 +212,79 @@ def options_from(
     context: QgsProcessingContext,
     every: bool = False,
 ) -> dict[str, Any]:
-    """Return the core's options by name from an algorithm's parameters: the presets first, named ones over them.
+    """Return the core's options by name from an algorithm's parameters: the quality first, named ones over it.
 
-    With `every`, those that have the core's default are named too: needed where they replace those of an earlier run.
+    Scripts may name any option of the core like a parameter, in capitals. With `every`, those that have the core's
+    default are named too: needed where they replace those of an earlier run. Raises `QgsProcessingException` with
+    what is wrong.
     """
     options: dict[str, Any] = {}
-    if algorithm.parameterDefinition(PRESET) is not None:
-        preset = algorithm.parameterAsEnumString(parameters, PRESET, context)
-        options.update({} if preset == "default" else {"preset": preset})
     if algorithm.parameterDefinition(QUALITY) is not None:
-        options.update(QUALITIES[algorithm.parameterAsEnumString(parameters, QUALITY, context)])
+        options.update(QUALITIES[chosen_word(algorithm, parameters, context, QUALITY)])
+    named: dict[str, Any] = {}
     for _, item in iterate_options():
         definition = algorithm.parameterDefinition(item.name.upper())
-        if definition is None or item.name in ("crs", "boundary"):
+        if item.name in ("crs", "boundary"):
+            continue
+        if definition is None:
+            if takes_further(algorithm) and parameters.get(item.name.upper()) not in (None, ""):
+                named[item.name] = parameters[item.name.upper()]
             continue
         value = _value(algorithm, definition, parameters, context)
-        if value == AS_BEFORE:
+        if value is None or value == AS_BEFORE:
             continue
-        if value is not None and (value != item.default or every):
-            options[item.name] = value
-        elif value is not None and parameters.get(definition.name()) is not None:
-            options.pop(item.name, None)  # the user named the default, against the preset
-    crs = crs_text(algorithm.parameterAsCrs(parameters, CRS, context)) if algorithm.parameterDefinition(CRS) else None
+        if value != item.default or every or parameters.get(definition.name()) is not None:
+            named[item.name] = value
+    crs = target_crs(algorithm, parameters, context)
     if crs:
-        options["crs"] = crs
-    return options
+        named["crs"] = crs
+    try:
+        further = (
+            read_options(algorithm.parameterAsString(parameters, OPTIONS, context)) if takes_further(algorithm) else {}
+        )
+        for name in further:
+            if parameters.get(name.upper()) not in (None, "") and further[name] != named.get(name):
+                raise OptionError(
+                    f"{name} is named among the further options and as a parameter of its own: name it once"
+                )
+        options.update(named)
+        options.update(further)
+        Options.from_flat({name: value for name, value in options.items() if value is not None})
+    except OptionError as error:
+        raise QgsProcessingException(str(error)) from error
+    for name in FILES:
+        if options.get(name.lower()) and not Path(options[name.lower()]).is_file():
+            title = algorithm.parameterDefinition(name)
+            raise QgsProcessingException(
+                tr("{}: {} does not exist, or is no file.").format(
+                    title.description() if title else name.lower(), options[name.lower()]
+                )
+            )
+    if every:
+        return options
+    defaults = {item.name: item.default for _, item in iterate_options()}
+    if options.get("preset", "default") != "default":
+        return options
+    return {name: value for name, value in options.items() if name == "preset" or value != defaults[name]}
+
+
+def takes_further(algorithm: QgsProcessingAlgorithm) -> bool:
+    """Return whether an algorithm takes all options of the core."""
+    return algorithm.parameterDefinition(OPTIONS) is not None
+
+
+def target_crs(
+    algorithm: QgsProcessingAlgorithm, parameters: dict[str, Any], context: QgsProcessingContext
+) -> str | None:
+    """Return the CRS that was named, as PROJ reads it; raises `QgsProcessingException` where it will not do."""
+    if algorithm.parameterDefinition(CRS) is None:
+        return None
+    crs, given = algorithm.parameterAsCrs(parameters, CRS, context), parameters.get(CRS)
+    if not crs.isValid() and isinstance(given, str) and given.strip():
+        raise QgsProcessingException(
+            tr("{} is no coordinate reference system that QGIS knows: write it as in EPSG:32633.").format(given)
+        )
+    return crs_text(crs)
 
 
 def _value(algorithm, definition, parameters, context) -> Any:
@@ -234,7 +292,7 @@ def _value(algorithm, definition, parameters, context) -> Any:
     if isinstance(definition, QgsProcessingParameterBoolean):
         return algorithm.parameterAsBoolean(parameters, name, context)
     if isinstance(definition, QgsProcessingParameterEnum):
-        return algorithm.parameterAsEnumString(parameters, name, context)
+        return chosen_word(algorithm, parameters, context, name)
     if isinstance(definition, QgsProcessingParameterNumber):
         if parameters.get(name) in (None, ""):
             return None
@@ -254,12 +312,30 @@ def crs_text(crs: QgsCoordinateReferenceSystem) -> str | None:
                 crs.authid() or crs.description()
             )
         )
+    if QgsUnitTypes.encodeUnit(crs.mapUnits()) != "meters":
+        raise QgsProcessingException(
+            tr("{} is in {}: choose a projected CRS in metres, or leave it empty for the UTM zone.").format(
+                crs.authid() or crs.description(), QgsUnitTypes.toString(crs.mapUnits())
+            )
+        )
     return crs.authid() if not crs.authid().startswith("USER:") and crs.authid() else crs.toWkt()
 
 
 def require_folder(path: str, what: str) -> Path:
     """Return the folder; raises `QgsProcessingException` when it is none."""
+    if not path:
+        raise QgsProcessingException(tr("{}: no folder is named.").format(what))
     folder = Path(path)
-    if not path or not folder.is_dir():
-        raise QgsProcessingException(tr("{}: {} is no folder.").format(what, path or tr("nothing")))
+    if folder.is_file():
+        raise QgsProcessingException(tr("{}: {} is a file; name the folder that it is in.").format(what, path))
+    if not folder.is_dir():
+        raise QgsProcessingException(tr("{}: {} is no folder.").format(what, path))
     return folder
+
+
+def require_file(path: str, what: str) -> Path:
+    """Return the file; raises `QgsProcessingException` when it is none."""
+    if not Path(path).is_file():
+        found = tr("is a folder; name a file") if Path(path).is_dir() else tr("does not exist")
+        raise QgsProcessingException(f"{what}: {path} {found}.")
+    return Path(path)

@@ -13,12 +13,16 @@ from .evaluate import Evaluate
 from .export_cameras import ExportCameras
 from .export_cloud import ExportCloud
 from .georeference import Georeference
+from .load_results import LoadResults
 from .reconstruct import ReconstructPhotographs
 from .reconstruct_flights import ReconstructFlights
+from .sample_flight import SampleFlight
 from .setup_environment import SetUpEnvironment
 
 ALGORITHMS = (
     ReconstructPhotographs,
+    SampleFlight,
+    LoadResults,
     ExportCloud,
     ExportCameras,
     Georeference,
@@ -88,6 +92,13 @@ class OnTheFly3RProvider(QgsProcessingProvider):
                 placeholder=settings.default_environment_folder(),
             )
         )
+        for name, title, empty in (
+            (settings.MODELS, tr("Folder of the weights of neural backbones"), settings.default_models_folder()),
+            (settings.CACHE, tr("Folder of temporary files of a run"), tr("that of the system")),
+        ):
+            ProcessingConfig.addSetting(
+                Setting(self.name(), name, title, "", valuetype=Setting.STRING, placeholder=empty)
+            )
         ProcessingConfig.readSettings()
         self.refreshAlgorithms()
         return True
@@ -96,7 +107,7 @@ class OnTheFly3RProvider(QgsProcessingProvider):
         """Take the settings away again."""
         from processing.core.ProcessingConfig import ProcessingConfig
 
-        for name in (settings.PYTHON, settings.ENVIRONMENT):
+        for name in (settings.PYTHON, settings.ENVIRONMENT, settings.MODELS, settings.CACHE):
             ProcessingConfig.removeSetting(name)
 
     def loadAlgorithms(self) -> None:

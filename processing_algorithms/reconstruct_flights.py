@@ -16,17 +16,27 @@ from qgis.core import (
     QgsProcessingParameterBoolean,
     QgsProcessingParameterFeatureSink,
     QgsProcessingParameterFile,
-    QgsProcessingParameterFolderDestination,
     QgsWkbTypes,
 )
 
 from ..core.onthefly3r.protocol import Job
 from .base import CoreAlgorithm, tr
 from .layers import REAL, TEXT, WHOLE, fill_sink
-from .parameters import add, add_all_options, add_backbone, add_georeference, add_quality, options_from
+from .output import OUTPUT, add_output, output_folder
+from .parameters import (
+    add,
+    add_backbone,
+    add_further_options,
+    add_georeference,
+    add_quality,
+    options_from,
+    require_file,
+    require_folder,
+)
 from .presentation import show
+from .reconstruct import require_backbone
 
-FOLDER, TABLE, SKIP_DONE, OUTPUT, FLIGHTS = "FOLDER", "TABLE", "SKIP_DONE", "OUTPUT", "FLIGHTS"
+FOLDER, TABLE, SKIP_DONE, FLIGHTS = "FOLDER", "TABLE", "SKIP_DONE", "FLIGHTS"
 
 FLIGHT_FIELDS = (
     *((name, TEXT) for name in ("flight", "status", "message", "photos", "out")),
@@ -73,16 +83,14 @@ class ReconstructFlights(CoreAlgorithm):
         add_quality(self)
         add_georeference(self)
         add_backbone(self)
-        add_all_options(self)
+        add_further_options(self)
         add(
             self,
             QgsProcessingParameterBoolean(SKIP_DONE, tr("Leave out what is done"), defaultValue=False),
             tr("Flights whose results are in the output folder already are not computed again."),
         )
-        add(
-            self,
-            QgsProcessingParameterFolderDestination(OUTPUT, tr("Output folder")),
-            tr("Holds a folder per flight, and flights.csv."),
+        add_output(
+            self, tr("Holds a folder per flight, and flights.csv. Left empty, a new one beside that of the flights.")
         )
         add(
             self,
@@ -97,18 +105,20 @@ class ReconstructFlights(CoreAlgorithm):
 
     def check(self, parameters: dict[str, Any], context: QgsProcessingContext) -> None:
         """Tell what is wrong before anything starts."""
-        self._flights(parameters, context)
+        output_folder(self, parameters, context, self._flights(parameters, context))
         options_from(self, parameters, context)
 
     def processAlgorithm(
         self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback
     ) -> dict[str, Any]:
         """Run all flights and show the table."""
-        out = Path(self.parameterAsString(parameters, OUTPUT, context))
         options = options_from(self, parameters, context)
         if self.parameterAsBoolean(parameters, SKIP_DONE, context):
             options["skip_done"] = True
         flights = self._flights(parameters, context)
+        out = output_folder(self, parameters, context, flights)
+        require_backbone(self, options, feedback)
+        feedback.pushInfo(tr("Results go to {}").format(out))
         rows = self.run_core(Job("batch", (str(flights), str(out)), options), feedback)["flights"]
         for row in rows:
             say = feedback.pushWarning if row["status"] == "failed" else feedback.pushInfo
@@ -132,7 +142,6 @@ class ReconstructFlights(CoreAlgorithm):
         table = self.parameterAsString(parameters, TABLE, context)
         if bool(folder) == bool(table):
             raise QgsProcessingException(tr("Give either a parent folder of flights or a table of flights."))
-        source = Path(folder or table)
-        if not source.exists():
-            raise QgsProcessingException(tr("{} does not exist.").format(source))
-        return source
+        if folder:
+            return require_folder(folder, tr("Parent folder of the flights"))
+        return require_file(table, tr("Table of flights"))

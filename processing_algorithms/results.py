@@ -12,29 +12,38 @@ from qgis.core import (
     QgsProcessingOutputFile,
     QgsProcessingOutputHtml,
     QgsProcessingOutputNumber,
+    QgsProcessingOutputRasterLayer,
     QgsProcessingOutputString,
     QgsProcessingParameterBoolean,
 )
 
 from ..plugin import settings
 from .base import CoreAlgorithm, tr
-from .layers import FOOTPRINT_FIELDS, add_camera_sinks, fill_camera_sinks, read_report, read_rows
+from .layers import add_camera_sinks, fill_camera_sinks, read_footprints, read_report
 from .parameters import add
-from .presentation import load_cloud
+from .presentation import load_survey
+from .survey import GEOPACKAGE
 
-LOAD_CLOUD = "LOAD_CLOUD"
+LOAD_RESULTS = "LOAD_RESULTS"
+RASTERS = {"ORTHOPHOTO": "Orthophoto", "DSM": "Surface model", "DTM": "Terrain model"}
+FEW_PLACED = 0.9
 
 
 def add_run_outputs(algorithm: CoreAlgorithm) -> None:
     """Declare the layers, files and numbers that every run gives."""
-    add_camera_sinks(algorithm)
     add(
         algorithm,
-        QgsProcessingParameterBoolean(LOAD_CLOUD, tr("Load the point cloud"), defaultValue=True),
-        tr("Add the cloud to the project, where this QGIS can read LAS files."),
-        advanced=True,
+        QgsProcessingParameterBoolean(LOAD_RESULTS, tr("Load the results into the project"), defaultValue=True),
+        tr(
+            "Adds the layers from the files in the output folder, in a group named after the survey: rejected "
+            "photographs, cameras, footprints, orthophoto, point cloud, surface model, as far as they were made."
+        ),
     )
+    add_camera_sinks(algorithm, by_default=False)
     algorithm.addOutput(QgsProcessingOutputFile("CLOUD", tr("Point cloud file")))
+    algorithm.addOutput(QgsProcessingOutputFile("GEOPACKAGE", tr("GeoPackage of the survey")))
+    for name, title in RASTERS.items():
+        algorithm.addOutput(QgsProcessingOutputRasterLayer(name, tr(title)))
     algorithm.addOutput(QgsProcessingOutputHtml("REPORT", tr("Report")))
     algorithm.addOutput(QgsProcessingOutputString("CRS_OUT", tr("Coordinate reference system of the results")))
     for name, title in (
@@ -53,9 +62,11 @@ def run_results(run: Path) -> dict[str, Any]:
     """Return the files and numbers of `add_run_outputs`; what a run lacks is None."""
     report = read_report(run / "report.json")
     geo, cloud = report["georeference"] or {}, report["cloud"] or {}
-    sampling = [values["gsd_m"] for values, _ in read_rows(run / "footprints.shp", FOOTPRINT_FIELDS)]
+    sampling = [values["gsd_m"] for values, _ in read_footprints(run) if values["gsd_m"] is not None]
     return {
         "CLOUD": str(run / cloud["path"]) if cloud else None,
+        "GEOPACKAGE": _existing(run / GEOPACKAGE),
+        **{name: _existing(run / f"{name.lower()}.tif") for name in RASTERS},
         "REPORT": str(run / "report.html"),
         "CRS_OUT": geo.get("crs", ""),
         "GIVEN": report["images"]["given"],
@@ -74,15 +85,31 @@ def hand_over(
     context: QgsProcessingContext,
     feedback: QgsProcessingFeedback,
     run: Path,
+    photos: Path | None,
 ) -> dict[str, Any]:
     """Fill the layers from the files of a finished run and return all outputs of `add_run_outputs`."""
     results = run_results(run)
-    settings.save_last_report(results["REPORT"])
+    settings.save_run(str(run))
     say_results(results, feedback)
-    layers = fill_camera_sinks(algorithm, parameters, context, feedback, run, run.name)
-    if results["CLOUD"] and algorithm.parameterAsBoolean(parameters, LOAD_CLOUD, context):
-        load_cloud(context, feedback, results["CLOUD"], run.name)
+    algorithm.warn(warnings_of(read_report(run / "report.json")), feedback)
+    layers = fill_camera_sinks(algorithm, parameters, context, feedback, run, photos)
+    if algorithm.parameterAsBoolean(parameters, LOAD_RESULTS, context):
+        load_survey(context, feedback, run, photos)
     return {**results, **layers}
+
+
+def warnings_of(report: dict[str, Any]) -> list[str]:
+    """Return what a report warns of; that few photographs were placed comes first, whether or not it says so."""
+    told = [str(warning) for warning in report.get("warnings") or ()]
+    given, placed = report["images"]["given"], report["images"]["placed"]
+    if placed < FEW_PLACED * given and not any(str(placed) in text and str(given) in text for text in told):
+        few = tr("Only {} of {} photographs were placed: see the rejected ones and their reasons.")
+        told.insert(0, few.format(placed, given))
+    return list(dict.fromkeys(told))
+
+
+def _existing(path: Path) -> str | None:
+    return str(path) if path.is_file() else None
 
 
 def say_results(results: dict[str, Any], feedback: QgsProcessingFeedback) -> None:

@@ -11,7 +11,17 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-SOURCES = ("core", "plugin", "processing_algorithms", "tools", "benchmarks", "docs", "tests", "bootstrap.py", "__init__.py")
+SOURCES = (
+    "core",
+    "plugin",
+    "processing_algorithms",
+    "tools",
+    "benchmarks",
+    "docs",
+    "tests",
+    "bootstrap.py",
+    "__init__.py",
+)
 # What the plugin imports of the core into QGIS's own process.
 LIGHT = """
 import sys
