@@ -25,7 +25,7 @@ from .presentation import show
 from .survey import HEIGHTS, photographs_folder, survey_title
 
 OUTPUT = "OUTPUT"
-FORMATS = ("laz", "las")
+FORMATS = ("laz", "las", "copc.laz")
 
 
 def cloud_destination(name: str, title: str) -> Any:
@@ -57,7 +57,7 @@ class ExportCloud(EarlierRunAlgorithm):
         add(
             self,
             cloud_destination(OUTPUT, tr("Point cloud")),
-            tr("A file ending in .laz or .las. It is LAS 1.4 with colour, confidence and the source photograph."),
+            tr("A file ending in .laz, .copc.laz or .las: LAS 1.4 with colour, confidence and source photograph."),
         )
         self.addOutput(QgsProcessingOutputNumber("POINTS", tr("Points")))
         self.addOutput(QgsProcessingOutputNumber("SPACING", tr("Mean distance of points [m]")))
@@ -70,11 +70,7 @@ class ExportCloud(EarlierRunAlgorithm):
         area_of(self, parameters, context)
         path = self.parameterAsFileOutput(parameters, OUTPUT, context)
         if _format(path) not in FORMATS:
-            raise QgsProcessingException(tr("{} ends neither in .laz nor in .las.").format(path))
-        if path.lower().endswith(".copc.laz"):
-            raise QgsProcessingException(
-                tr("{}: clouds are written as plain LAZ, not as COPC: leave out .copc.").format(path)
-            )
+            raise QgsProcessingException(tr("{} ends neither in .laz, .copc.laz nor in .las.").format(path))
 
     def processAlgorithm(
         self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback
@@ -82,7 +78,7 @@ class ExportCloud(EarlierRunAlgorithm):
         """Export into a scratch folder and keep the cloud."""
         run = self.run_folder(parameters, context)
         out = self._destination(parameters, context)
-        options = {**options_from(self, parameters, context, every=True), "format": _format(str(out))}
+        options = {**options_from(self, parameters, context, every=True), "format": _format(str(out)).partition(".")[0]}
         with scratch_folder(out) as scratch, boundary_file(self, parameters, context) as boundary:
             self.export(run, scratch, {**options, "boundary": boundary}, feedback)
             report = json.loads((scratch / "report.json").read_text(encoding="utf-8"))
@@ -116,4 +112,6 @@ class ExportCloud(EarlierRunAlgorithm):
 
 
 def _format(path: str) -> str:
-    return Path(path).suffix.lower().lstrip(".")
+    """Return the ending of a cloud's name, which is that of the core's own file too."""
+    name = Path(path).name.lower()
+    return "copc.laz" if name.endswith(".copc.laz") else Path(name).suffix.lstrip(".")

@@ -26,7 +26,7 @@ def read_options(text: str) -> dict[str, Any]:
     a comment. Names are those of the command line, values are checked.
     """
     text = text.strip()
-    if text and "=" not in text.splitlines()[0]:
+    if text and "\n" not in text and ("=" not in text or Path(text.strip("\"'")).is_file()):
         text = _preset(text)
     text = _COMMENT.sub("", text).strip()
     found = list(_NAME.finditer(text))
@@ -78,7 +78,7 @@ def _value(name: str, text: str) -> Any:
 def _preset(text: str) -> str:
     path = Path(text.strip("\"'"))
     if not path.is_file():
-        raise OptionError(f"{text.splitlines()[0]!r} is neither name=value nor a file of such lines")
+        raise OptionError(f"{text!r} is neither name=value nor a file of such lines")
     try:
         if path.stat().st_size > MAX_PRESET_BYTES:
             raise OptionError(f"{path}: larger than {MAX_PRESET_BYTES // 1024} KiB and no file of options")

@@ -29,6 +29,7 @@ from .parameters import (
     require_folder,
 )
 from .results import add_run_outputs, hand_over
+from .survey import shows_copc
 
 PHOTOS = "PHOTOS"
 
@@ -113,6 +114,8 @@ class ReconstructPhotographs(CoreAlgorithm):
         photos = photographs(self, parameters, context)
         run = output_folder(self, parameters, context, photos)
         options = options_from(self, parameters, context)
+        if "format" not in options and shows_copc():  # the one that QGIS shows at once
+            options["format"] = "copc"
         require_backbone(self, options, feedback)
         feedback.pushInfo(tr("Results go to {}").format(run))
         with boundary_file(self, parameters, context) as boundary:

@@ -78,6 +78,11 @@ def has_unreadable_cloud(run: Path, providers: Collection[str] | None = None) ->
     return any((run / name).is_file() for name, _ in CLOUDS) and not _cloud(run, providers)
 
 
+def shows_copc() -> bool:
+    """Return whether this QGIS shows COPC files as they are."""
+    return "copc" in QgsProviderRegistry.instance().providerList()
+
+
 def photographs_folder(run: Path) -> Path | None:
     """Return the folder of photographs that a run was made from, None where it does not say, or it is gone."""
     try:

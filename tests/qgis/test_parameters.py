@@ -31,7 +31,7 @@ def test_nothing_named_leaves_the_defaults_of_the_core(options_of: Any) -> None:
 
 def test_quality_sets_sizes_and_named_ones_go_before_it(options_of: Any) -> None:
     assert options_of("reconstruct", {"QUALITY": "preview"}) == {"working_px": 600, "dense_px": 250, "features": 2000}
-    assert options_of("reconstruct", {"QUALITY": "preview", "WORKING_PX": 1000, "DENSE_PX": 300}) == {
+    assert options_of("reconstruct", {"QUALITY": "preview", "WORKING_PX": 1000, "OPTIONS": "dense_px=300"}) == {
         "dense_px": 300,
         "features": 2000,
     }
@@ -42,13 +42,11 @@ def test_values_have_the_types_of_the_core(options_of: Any, plugin: Any, tmp_pat
         "CRS": "EPSG:25833",
         "VERTICAL": "egm96",
         "BACKBONE": "pi3",
-        "PRESET": "paper",
-        "SEED_SIZE": 20,
-        "SPACING_M": 0.25,
-        "STRAY_FILTER": False,
+        "OPTIONS": "preset=paper seed-size=20\nspacing_m=0.25, stray_filter = no",
         "WEIGHTS": "owner/name@abc",
         "POSITIONS": str(tmp_path / "geo.txt"),
     }
+    (tmp_path / "geo.txt").write_text("EPSG:4326")
     named = options_of("reconstruct", parameters)
     assert named == {
         "crs": "EPSG:25833",
@@ -67,16 +65,14 @@ def test_values_have_the_types_of_the_core(options_of: Any, plugin: Any, tmp_pat
 @pytest.mark.parametrize(
     ("name", "title"),
     [
-        ("WORKING_PX", "Size of the photographs while reconstructing [px]"),
-        ("MAX_GPU_MEMORY_GIB", "Max GPU memory [GiB]"),
-        ("SEED_SIZE", "Seed size"),
-        ("GPS_CANDIDATES", "GPS candidates"),
+        ("SPACING_M", "Distance of points [m]"),
+        ("MIN_CONFIDENCE", "Least confidence of a point, 0 to 1"),
     ],
 )
 def test_titles(qgis: Any, name: str, title: str) -> None:
     from qgis.core import QgsApplication
 
-    algorithm = QgsApplication.processingRegistry().algorithmById("onthefly3r:reconstruct")
+    algorithm = QgsApplication.processingRegistry().algorithmById("onthefly3r:exportcloud")
     assert algorithm.parameterDefinition(name).description() == title
 
 
@@ -137,3 +133,58 @@ def test_boundary_is_handed_over_in_degrees(qgis: Any, plugin: Any) -> None:
         boundary_file(algorithm, {"EXTENT": "0,1,0,1"}, QgsProcessingContext()),
     ):
         pass
+
+
+@pytest.mark.parametrize("given", ["full", "FULL", 2, "2"])
+def test_choices_are_words_or_numbers(options_of: Any, given: Any) -> None:
+    assert options_of("reconstruct", {"QUALITY": given})["working_px"] == 1600
+    assert options_of("reconstruct", {"VERTICAL": 2}) == {"vertical": "egm96"}
+
+
+@pytest.mark.parametrize(
+    ("text", "options"),
+    [
+        ("", {}),
+        ("threads=2", {"threads": 2}),
+        ("--threads=2; --min-confidence=1", {"threads": 2, "min_confidence": 1.0}),
+        ("# for the office\nWORKING_PX = 800\nrecursive = No\n", {"working_px": 800, "recursive": False}),
+        ("crs=EPSG:25833 weights='/with blank/x y.pt', device=cuda", {
+            "crs": "EPSG:25833", "weights": "/with blank/x y.pt", "device": "cuda"}),
+        (r"weights=C:\models\da3 small.safetensors", {"weights": r"C:\models\da3 small.safetensors"}),
+        ("limit=", {"limit": None}),
+    ],
+)  # fmt: skip
+def test_further_options(plugin: Any, text: str, options: dict[str, Any]) -> None:
+    if "weights" in options:
+        text, options = f"backbone=pi3 {text}", {"backbone": "pi3", **options}
+    assert plugin("processing_algorithms.option_text").read_options(text) == options
+
+
+def test_further_options_from_a_file(plugin: Any, tmp_path: Path) -> None:
+    preset = tmp_path / "büro preset.txt"
+    preset.write_text("# ours\nthreads=2\nspacing_m=0.1\n", encoding="utf-8-sig")
+    read = plugin("processing_algorithms.option_text").read_options
+    assert read(str(preset)) == read(f'"{preset}"') == {"threads": 2, "spacing_m": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("thread=2", "did you mean threads"),
+        ("threads=two", "'two' is no whole number"),
+        ("threads=1.5", "'1.5' is no whole number"),
+        ("threads=-1", "below the minimum"),
+        ("spacing_m=fine", "'fine' is no number"),
+        ("spacing_m=nan", "not a finite number"),
+        ("recursive=perhaps", "recursive: 'perhaps' is not a bool"),
+        ("format=ply", "not one of laz"),
+        ("preset=mine", "preset: 'mine' is not one of"),
+        ("fast threads=2", "'fast' is not an option"),
+        ("threads=1 threads=2", "threads is named twice"),
+        ("no such file", "neither name=value nor a file"),
+        ("local=yes crs=EPSG:25833", "use only one of the two"),
+    ],
+)
+def test_wrong_further_options_are_told(plugin: Any, text: str, told: str) -> None:
+    with pytest.raises(plugin("core.onthefly3r.errors").OptionError, match=told):
+        plugin("processing_algorithms.option_text").read_options(text)

@@ -24,9 +24,10 @@ def loaded(qgis: Any, run: dict[str, Any], project: Any) -> Any:
     return project
 
 
-def test_layers_are_grouped_under_the_name_of_the_run(loaded: Any, run: dict[str, Any]) -> None:
+def test_layers_are_grouped_under_the_name_of_the_survey(loaded: Any, run: dict[str, Any], survey: Path) -> None:
     root = loaded.layerTreeRoot()
-    group = root.findGroup(Path(run["OUTPUT"]).name)
+    (group,) = root.children()
+    assert group.name() == survey.name and survey.name != Path(run["OUTPUT"]).name
     names = [node.name() for node in group.children()]
     assert sorted(names) == ["Cameras", "Footprints", "Rejected photographs"]
     assert names[-1] == "Footprints"  # below the points
@@ -71,33 +72,6 @@ def test_styles_use_fields_that_the_layers_have(plugin: Any, style: str) -> None
     assert used and used <= names
 
 
-def test_cloud_is_loaded_where_qgis_can_read_it(
-    qgis: Any, plugin: Any, feedback: Any, monkeypatch: pytest.MonkeyPatch, project: Any
-) -> None:
-    from qgis.core import QgsProcessingContext, QgsProviderRegistry
-
-    presentation = plugin("processing_algorithms.presentation")
-    context = QgsProcessingContext()
-    context.setProject(project)
-
-    class Registry:
-        def __init__(self, *providers: str) -> None:
-            self._providers = providers
-
-        def providerList(self) -> list[str]:
-            return list(self._providers)
-
-    monkeypatch.setattr(presentation, "QgsProviderRegistry", type("R", (), {"instance": lambda: Registry("ogr")}))
-    presentation.load_cloud(context, feedback, "/a/cloud.laz", "run")
-    assert not context.layersToLoadOnCompletion()
-    assert "no reader for LAS files" in feedback.told[-1] and "/a/cloud.laz" in feedback.told[-1]
-    monkeypatch.setattr(presentation, "QgsProviderRegistry", type("R", (), {"instance": lambda: Registry("pdal")}))
-    presentation.load_cloud(context, feedback, "/a/cloud.laz", "run")
-    details = context.layersToLoadOnCompletion()["/a/cloud.laz"]
-    assert details.name == "Point cloud" and details.postProcessor() is not None
-    assert QgsProviderRegistry.instance() is not None
-
-
 def test_newer_qgis_groups_and_orders_itself(plugin: Any) -> None:
     class Details:
         def __init__(self) -> None:
@@ -116,9 +90,9 @@ def test_newer_qgis_groups_and_orders_itself(plugin: Any) -> None:
         def layerToLoadOnCompletionDetails(self, name: str) -> Details:
             return self.details[name]
 
-    context = Context()
+    context, heights = Context(), plugin("processing_algorithms.survey").HEIGHTS
     for name in ("cameras", "footprints", "not loaded"):
-        plugin("processing_algorithms.presentation").show(context, name, "run", f"{name}.qml")
+        plugin("processing_algorithms.presentation").show(context, name, "run", f"{name}.qml", heights.get(name, 0))
     assert {details.groupName for details in context.details.values()} == {"run"}
     assert context.details["cameras"].layerSortKey > context.details["footprints"].layerSortKey
     assert all(details.kept is not None for details in context.details.values())
@@ -161,18 +135,26 @@ def test_menu_opens_and_goes_away(qgis: Any, plugin: Any, run: dict[str, Any], m
                 self.toolbar.remove(action)
 
     monkeypatch.setattr(main.OnTheFly3RPlugin, "initProcessing", lambda self: None)
-    plugin("plugin.settings").save_last_report(run["REPORT"])
+    plugin("plugin.settings").save_run(run["OUTPUT"])
+    asked: list[Any] = []
+    monkeypatch.setattr(qgis, "runAndLoadResults", lambda *words: asked.append(words))
     interface = Interface()
     shown = main.OnTheFly3RPlugin(interface)
     shown.initGui()
-    assert len(interface.menu) == 4 and len(interface.toolbar) == 1
+    assert len(interface.menu) == 7 and len(interface.toolbar) == 1
     assert not any(action.icon().isNull() for action in interface.menu)
     for action in interface.menu:
         action.trigger()
-    assert opened == ["onthefly3r:reconstruct", run["REPORT"], "onthefly3r:setup"]
+    names = ["onthefly3r:reconstruct", "onthefly3r:sampleflight", run["REPORT"], "onthefly3r:setup"]
+    assert opened[:4] == names and opened[4].endswith(".html") and len(opened) == 5
+    recent = interface.menu[3].menu()
+    recent.aboutToShow.emit()
+    assert recent.actions()[0].text() == run["OUTPUT"]
+    recent.actions()[0].trigger()
+    assert asked == [("onthefly3r:loadresults", {"RUN": run["OUTPUT"]})]
     assert interface.said == ["Copied."] or interface.said == ["No failure has been noted."]
     plugin("plugin.settings").save_diagnostics("what happened")
-    interface.menu[3].trigger()
+    interface.menu[6].trigger()
     assert QGuiApplication.clipboard().text() == "what happened"
     shown.unload()
     assert not interface.menu and not interface.toolbar

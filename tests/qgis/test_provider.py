@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 
 ALGORITHMS = {
+    "loadresults",
+    "sampleflight",
     "reconstruct",
     "exportcloud",
     "exportcameras",
@@ -31,7 +33,7 @@ def test_qgis_process_lists_them(qgis_process: Any) -> None:
     assert listed.returncode == 0
     assert set(re.findall(r"^\s+onthefly3r:(\w+)\t", listed.stdout, flags=re.MULTILINE)) == ALGORITHMS
     shown = qgis_process("help", "onthefly3r:reconstruct")
-    assert "longest side to which photographs are reduced" in shown.stdout.lower()
+    assert "name=value, a line each" in shown.stdout
 
 
 def test_provider(qgis: Any, plugin: Any) -> None:
@@ -59,17 +61,38 @@ def test_every_parameter_output_and_algorithm_is_described(qgis: Any) -> None:
             assert output.description(), f"{algorithm.name()} {output.name()}"
         names = [item.name() for item in (*algorithm.parameterDefinitions(), *algorithm.outputDefinitions())]
         destinations = {item.name() for item in algorithm.destinationParameterDefinitions()}
-        assert {name for name in names if names.count(name) > 1} <= destinations
+        assert {name for name in names if names.count(name) > 1} <= destinations | {"OUTPUT"}
 
 
 def test_every_option_of_the_core_has_a_parameter(qgis: Any, plugin: Any) -> None:
-    from qgis.core import QgsApplication
+    from qgis.core import QgsApplication, QgsProcessingParameterDefinition
 
     algorithm = QgsApplication.processingRegistry().algorithmById("onthefly3r:reconstruct")
-    named = {parameter.name() for parameter in algorithm.parameterDefinitions()}
-    options = {item.name.upper() for _, item in plugin("core.onthefly3r.options").iterate_options()}
-    assert options - named == {"CLOUD"}
-    assert {"PHOTOS", "QUALITY", "PRESET", "EXTENT", "OUTPUT"} <= named
+    definitions = algorithm.parameterDefinitions()
+    named = {parameter.name() for parameter in definitions}
+    assert {"PHOTOS", "QUALITY", "CRS", "CONTROL", "BOUNDARY", "EXTENT", "OPTIONS", "OUTPUT"} <= named
+    advanced = QgsProcessingParameterDefinition.Flag.FlagAdvanced
+    assert len([item for item in definitions if not item.flags() & advanced]) <= 11
+    text = plugin("processing_algorithms.option_text")
+    for _, item in plugin("core.onthefly3r.options").iterate_options():
+        assert text.known_name(item.name.upper().replace("_", "-")) == item.name
+
+
+def test_words_that_people_look_for_find_it(qgis: Any) -> None:
+    for algorithm in algorithms():
+        assert {"uav", "drone", "photogrammetry", "sfm", "lidar", "orthophoto", "dem"} <= set(algorithm.tags())
+
+
+def test_help_is_a_page(qgis: Any, plugin: Any) -> None:
+    from qgis.PyQt.QtCore import QUrl
+
+    page = Path(QUrl(plugin("plugin.help_page").help_page()).toLocalFile())
+    text = page.read_text(encoding="utf-8")
+    assert page.suffix == ".html" and "<table" in text and "First run" in text
+    pictures = re.findall(r'src="([^"]+)"', text)
+    assert pictures and all(Path(QUrl(name).toLocalFile()).is_file() for name in pictures)
+    assert "**" not in text and "](" not in text
+    assert algorithms()[0].helpUrl().endswith(".html")
 
 
 def test_backbones_are_those_of_the_core(qgis: Any, plugin: Any) -> None:
@@ -131,4 +154,37 @@ def test_options_page_shows_the_settings(qgis: Any) -> None:
     from processing.core.ProcessingConfig import ProcessingConfig
 
     shown = ProcessingConfig.getSettings()["On-the-Fly3R"]
-    assert [setting.name for setting in shown] == ["ONTHEFLY3R_PYTHON", "ONTHEFLY3R_ENVIRONMENT"]
+    names = ["ONTHEFLY3R_PYTHON", "ONTHEFLY3R_ENVIRONMENT", "ONTHEFLY3R_WEIGHTS", "ONTHEFLY3R_SCRATCH"]
+    assert [setting.name for setting in shown] == names
+
+
+def test_worker_learns_the_folders_that_the_settings_name(qgis: Any, plugin: Any, tmp_path: Path) -> None:
+    from qgis.core import QgsSettings
+
+    settings, worker = plugin("plugin.settings"), plugin("plugin.worker")
+    assert settings.worker_variables() == {}
+    named = {settings.MODELS: str(tmp_path / "weights"), settings.CACHE: str(tmp_path)}
+    try:
+        for name, folder in named.items():
+            QgsSettings().setValue(f"Processing/Configuration/{name}", folder)
+        environ = worker.worker_environ(settings.worker_variables())
+    finally:
+        for name in named:
+            QgsSettings().remove(f"Processing/Configuration/{name}")
+    assert environ["ONTHEFLY3R_WEIGHTS"] == str(tmp_path / "weights")
+    assert environ["TMPDIR"] == environ["TEMP"] == str(tmp_path)
+
+
+def test_recent_runs_are_those_that_are_still_there(qgis: Any, plugin: Any, tmp_path: Path) -> None:
+    settings = plugin("plugin.settings")
+    runs = [tmp_path / name for name in ("a", "b", "c")]
+    for run in runs:
+        run.mkdir()
+        (run / "report.json").write_text("{}")
+        (run / "report.html").write_text("")
+        settings.save_run(str(run))
+    assert settings.recent_runs()[:3] == [str(run) for run in reversed(runs)]
+    assert settings.last_report() == str(runs[2] / "report.html")
+    settings.save_run(str(runs[0]))
+    (runs[2] / "report.json").unlink()
+    assert settings.recent_runs()[:2] == [str(runs[0]), str(runs[1])]

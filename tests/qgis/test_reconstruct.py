@@ -48,11 +48,12 @@ def test_layers_have_crs_fields_and_the_place_of_the_survey(run: dict[str, Any],
     assert abs(middle.x() - east) < 60.0 and abs(middle.y() - north) < 60.0
     assert footprints.extent().contains(cameras.extent())
     first = next(cameras.getFeatures())
+    assert Path(first["path"]) == survey / "photos" / first["image"] and Path(first["path"]).is_file()
     assert first["status"] == "placed" and first["used"] is True and first["rtk"] == 50
     assert abs(first["x"] - first["gps_x"] - first["dx"]) < 1e-3
     assert abs(first.geometry().constGet().z() - first["z"]) < 1e-3
     assert abs(first["pitch"] + 90.0) < 5.0
-    assert len(cameras.fields()) == 29
+    assert len(cameras.fields()) == 30
     for layer in (cameras, footprints):
         assert sorted(feature["number"] for feature in layer.getFeatures()) == list(range(1, 13))
     assert not next(footprints.getFeatures()).geometry().isMultipart()
