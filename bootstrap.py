@@ -7,7 +7,7 @@
     python3 bootstrap.py test [pytest arguments...]   lint, types and tests, those of QGIS too where it is installed
     python3 bootstrap.py test --quick                 lint, types and the fast tests, with the base installation only
     python3 bootstrap.py lint                         lint and types
-    python3 bootstrap.py package                      write the zip of the QGIS plugin
+    python3 bootstrap.py package [--publish]          write the zip of the QGIS plugin; one to hand in
 
 Standard library only, Linux, macOS and Windows, no administrator rights. Other programs may import this
 module and call `create_environment`.
@@ -51,6 +51,11 @@ TEST_CONSTRAINTS = "torch==2.13.0\n"
 # A model whose adapter is tested on its own code. What it names as dependencies contradicts ours (numpy below 2);
 # what its network really needs is in the extra `test`.
 TEST_MODELS = ('depth-anything-3==0.1.1; python_version < "3.13"',)
+
+# On Windows the public index has torch for the processor only; the builds for NVIDIA GPUs are at its makers' own.
+TORCH_GPU_INDEX = "https://download.pytorch.org/whl/cu126"
+
+NO_WINDOW = getattr(subprocess, "CREATE_NO_WINDOW", 0)  # of Windows: no console flashes up
 
 Report = Callable[[str], None]
 
@@ -130,6 +135,8 @@ def create_environment(
     _check_room(folder, wanted)
     (folder / STAMP_NAME).unlink(missing_ok=True)
     named = f"[{','.join(sorted(wanted))}]" if wanted else ""
+    if torch_index(platform.system(), wanted, has_nvidia_gpu):
+        _install_gpu_torch(python, constraints, progress)
     progress(f"Installing onthefly3r{named} into {folder}; the first time takes some minutes.")
     _pip_install(python, ["-e", f"{source}{named}"], constraints, progress)
     for requirement in sorted(lone):
@@ -144,15 +151,30 @@ def create_environment(
     return python
 
 
+def _ask(
+    command: Sequence[str], environ: Mapping[str, str], timeout_s: float | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run a command without a window and return what it wrote, whatever the code page of the console."""
+    return subprocess.run(
+        list(command),
+        capture_output=True,
+        encoding="utf-8",
+        errors="replace",
+        check=False,
+        env=dict(environ),
+        stdin=subprocess.DEVNULL,
+        timeout=timeout_s,
+        creationflags=NO_WINDOW,
+    )
+
+
 def has_nvidia_gpu() -> bool:
     """Return whether nvidia-smi is there, works, and lists a GPU."""
     tool = shutil.which("nvidia-smi")
     if tool is None:
         return False
     try:
-        listing = subprocess.run(
-            [tool, "-L"], capture_output=True, text=True, timeout=60, check=False, stdin=subprocess.DEVNULL
-        )
+        listing = _ask([tool, "-L"], os.environ, timeout_s=60)
     except (OSError, subprocess.TimeoutExpired):
         return False
     return listing.returncode == 0 and "GPU" in listing.stdout
@@ -170,7 +192,7 @@ def _version_of(python: Path) -> str:
     """Return an interpreter's version, empty when it does not run."""
     command = [str(python), "-c", "import platform; print(platform.python_version())"]
     try:
-        ran = subprocess.run(command, capture_output=True, text=True, check=False, env=clean_environ())
+        ran = _ask(command, clean_environ())
     except OSError:
         return ""
     return ran.stdout.strip() if ran.returncode == 0 else ""
@@ -211,15 +233,7 @@ def _make_venv(folder: Path, progress: Report) -> None:
             f"(or python{version}-venv), then run this command again."
         )
     progress(f"Making the environment {folder}")
-    made = subprocess.run(
-        [sys.executable, "-m", "venv", str(folder)],
-        capture_output=True,
-        text=True,
-        errors="replace",
-        check=False,
-        env=clean_environ(),
-        stdin=subprocess.DEVNULL,
-    )
+    made = _ask([sys.executable, "-m", "venv", str(folder)], clean_environ())
     if made.returncode != 0:
         told = (made.stdout + made.stderr).strip()
         remedy = " (on Debian and Ubuntu: sudo apt-get install python3-venv)" if "ensurepip" in told else ""
@@ -250,6 +264,7 @@ def _pip_install(python: Path, wanted: Sequence[str], constraints: str, progress
             encoding="utf-8",
             errors="replace",
             env=clean_environ(),
+            creationflags=NO_WINDOW,
         )
         told: list[str] = []
         assert process.stdout is not None
@@ -260,6 +275,23 @@ def _pip_install(python: Path, wanted: Sequence[str], constraints: str, progress
                     progress(f"  {line.strip()[:110]}")
         if process.wait() != 0:
             raise SetupError(explain_pip_failure("\n".join(told[-60:])))
+
+
+def torch_index(system: str, extras: Iterable[str], has_gpu: Callable[[], bool]) -> str:
+    """Return the index that torch with GPU support comes from, empty where the public index has it or none is wanted.
+
+    `system` is that of the module `platform`.
+    """
+    return TORCH_GPU_INDEX if system == "Windows" and "neural" in set(extras) and has_gpu() else ""
+
+
+def _install_gpu_torch(python: Path, constraints: str, progress: Report) -> None:
+    """Install torch for the GPU first, so that the package finds it there; without it, the processor's will do."""
+    progress(f"Installing torch for the GPU from {TORCH_GPU_INDEX}")
+    try:
+        _pip_install(python, ["torch", "--index-url", TORCH_GPU_INDEX], constraints, progress)
+    except SetupError as error:
+        progress(f"{error}\nGoing on with torch for the processor; neural backbones will be slow.")
 
 
 def explain_pip_failure(told: str) -> str:
@@ -300,15 +332,7 @@ def _call(command: Sequence[str | Path], **variables: str) -> int:
 
 def missing_system_libraries(python: Path) -> list[str]:
     """Return one sentence for each package of the environment that a system library is missing for."""
-    told = subprocess.run(
-        [str(python), "-m", "onthefly3r", "doctor", "--json"],
-        capture_output=True,
-        text=True,
-        encoding="utf-8",
-        check=False,
-        env=clean_environ(),
-        stdin=subprocess.DEVNULL,
-    ).stdout
+    told = _ask([str(python), "-m", "onthefly3r", "doctor", "--json"], clean_environ()).stdout
     try:
         checks = json.loads(told)["checks"]
     except (ValueError, KeyError, TypeError):
@@ -337,9 +361,7 @@ def find_qgis() -> tuple[str, str]:
 def _can_import(python: str, module: str) -> bool:
     command = [python, "-c", f"import {module}"]
     environ = {**clean_environ(), "QT_QPA_PLATFORM": "offscreen"}
-    return (
-        subprocess.run(command, capture_output=True, check=False, env=environ, stdin=subprocess.DEVNULL).returncode == 0
-    )
+    return _ask(command, environ).returncode == 0
 
 
 def setup(environment: Path, rest: Sequence[str] = ()) -> int:
@@ -415,9 +437,9 @@ def test(environment: Path, rest: Sequence[str]) -> int:
     return 1 if failed else 0
 
 
-def package() -> int:
+def package(rest: Sequence[str] = ()) -> int:
     """Write the zip of the QGIS plugin into `dist`."""
-    return _call([sys.executable, ROOT / "tools" / "package_plugin.py"])
+    return _call([sys.executable, ROOT / "tools" / "package_plugin.py", *rest])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -438,7 +460,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if chosen.verb == "setup":
             return setup(environment, chosen.rest)
         if chosen.verb == "package":
-            return package()
+            return package(chosen.rest)
         if chosen.verb == "demo":
             named = bool(chosen.rest) and not chosen.rest[0].startswith("-")
             out = Path(chosen.rest.pop(0)) if named else Path("demo-survey")

@@ -77,7 +77,7 @@ def file_url(path: PurePath | str) -> str:
     text = str(path).replace("\\", "/") if re.match(r"[A-Za-z]:[\\/]|\\\\", str(path)) else str(path)
     quoted = quote(text, safe="/:")
     if text.startswith("//"):  # \\server\share
-        return f"file:{quoted}"
+        return f"file:{quoted}"  # file://server/share
     return f"file://{quoted}" if text.startswith("/") else f"file:///{quoted}"
 
 

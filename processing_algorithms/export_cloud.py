@@ -16,6 +16,7 @@ from qgis.core import (
     QgsProcessingParameterFileDestination,
 )
 
+from ..core.onthefly3r.files.atomic import replace_file
 from ..core.onthefly3r.files.las_index import indexes_beside, indexes_of
 from .base import tr
 from .boundary import add_boundary, area_of, boundary_file
@@ -86,7 +87,7 @@ class ExportCloud(EarlierRunAlgorithm):
                 feedback.pushWarning(tr("The run is not georeferenced: the cloud is in map units."))
             stale = indexes_of(out)
             try:
-                (scratch / f"cloud.{_format(str(out))}").replace(out)
+                replace_file(scratch / f"cloud.{_format(str(out))}", out)
             except OSError as error:
                 raise QgsProcessingException(tr("{} cannot be written ({}).").format(out, error.strerror)) from error
             for index in stale:  # of the cloud that was replaced: QGIS would show it instead of the new one

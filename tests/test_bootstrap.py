@@ -384,3 +384,65 @@ def test_environment_that_was_cut_short_is_made_anew(bootstrap: ModuleType, tmp_
     (tmp_path / "lib" / "half.py").touch()
     bootstrap._claim(tmp_path, stamped=False)
     assert [path.name for path in tmp_path.iterdir()] == [bootstrap.MARK_NAME]
+
+
+@pytest.mark.parametrize(
+    ("system", "extras", "gpu", "asked"),
+    [
+        ("Windows", ["neural"], True, True),
+        ("Windows", ["neural"], False, False),
+        ("Windows", ["cloud"], True, False),
+        ("Linux", ["neural"], True, False),
+        ("Darwin", ["neural"], True, False),
+    ],
+)
+def test_torch_for_the_gpu_has_an_index_of_its_own_on_windows(
+    bootstrap: ModuleType, system: str, extras: list[str], gpu: bool, asked: bool
+) -> None:
+    index = bootstrap.torch_index(system, extras, lambda: gpu)
+    assert index == (bootstrap.TORCH_GPU_INDEX if asked else "")
+
+
+def test_torch_for_the_gpu_comes_first_and_may_fail(
+    bootstrap: ModuleType, installer: Installer, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[list[str]] = []
+
+    def install(python: Path, wanted: Sequence[str], constraints: str, progress: Any) -> None:
+        asked.append(list(wanted))
+        if "--index-url" in wanted:
+            raise bootstrap.SetupError("The package index cannot be reached.")
+
+    monkeypatch.setattr(bootstrap, "_pip_install", install)
+    monkeypatch.setattr(bootstrap.platform, "system", lambda: "Windows")
+    monkeypatch.setattr(bootstrap, "has_nvidia_gpu", lambda: True)
+    told: list[str] = []
+    bootstrap.create_environment(tmp_path / "env", ["neural"], told.append, source=source)
+    assert [words[0] for words in asked] == ["torch", "-e"]
+    assert any("cannot be reached" in line and "processor" in line for line in told)
+
+
+def test_environment_of_windows_has_its_interpreter_elsewhere(
+    bootstrap: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(bootstrap.os, "name", "nt")
+        python = bootstrap.environment_python(tmp_path)
+    assert python.relative_to(tmp_path).as_posix() == "Scripts/python.exe"
+
+
+def test_answers_in_another_code_page_are_read(bootstrap: ModuleType) -> None:
+    script = "import sys; sys.stdout.buffer.write(bytes(range(128, 256)))"
+    assert len(bootstrap._ask([sys.executable, "-c", script], {}).stdout) > 10
+
+
+def test_output_that_the_console_cannot_show_is_no_error(
+    bootstrap: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import io
+
+    console = io.TextIOWrapper(io.BytesIO(), encoding="cp1252")
+    monkeypatch.setattr(sys, "stdout", console)
+    bootstrap.say("Vermessung ü 測量")
+    console.flush()
+    assert console.buffer.getvalue().decode("cp1252").strip() == "Vermessung ü ??"

@@ -27,7 +27,7 @@ LIGHT = """
 import sys
 sys.path.insert(0, sys.argv[1])
 from onthefly3r.errors import OptionError
-from onthefly3r.files import las_index
+from onthefly3r.files import atomic, las_index
 from onthefly3r.options import Options, iterate_options
 from onthefly3r.protocol import Event, Job
 assert Options.from_flat({"spacing_m": 1, "limit": None, "crs": "EPSG:32633"}).export.spacing_m == 1

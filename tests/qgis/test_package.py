@@ -65,10 +65,53 @@ def test_metadata(metadata: configparser.SectionProxy, archive: zipfile.ZipFile)
     assert "plugin" not in metadata["name"].lower()
     assert metadata["license"] == "GPL-2.0-or-later"
     assert "External dependencies" in metadata["about"]
+    assert "@" not in metadata["about"]
     requirements = re.search(r"dependencies = \[(.*?)\]\n", (ROOT / "pyproject.toml").read_text(), re.DOTALL)
     assert requirements
     for name in re.findall(r'"([\w-]+)', requirements.group(1)):
         assert name in metadata["about"], name
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "refused"),
+    [
+        ("tracker", "https://onthefly3r.example/issues", True),
+        ("repository", "https://example.org/x", True),
+        ("homepage", "http://localhost:8000/", True),
+        ("homepage", "somewhere", True),
+        ("email", "maintainers@drones.invalid", True),
+        ("email", "nobody", True),
+        ("homepage", "https://surveys.org/example", False),
+        ("author", "Example Surveys Ltd", False),
+    ],
+)
+def test_publish_refuses_examples(name: str, value: str, refused: bool, tmp_path: Path) -> None:
+    import package_plugin
+
+    real = {
+        "author": "A. Surveyor",
+        "email": "office@surveys.org",
+        "homepage": "https://surveys.org",
+        "repository": "https://code.surveys.org/onthefly3r",
+        "tracker": "https://code.surveys.org/onthefly3r/issues",
+    }
+    lines = "\n".join(f"{key} = {text}" for key, text in {**real, name: value}.items())
+    (tmp_path / "publisher.cfg").write_text(f"[publisher]\n{lines}\n", encoding="utf-8")
+    if refused:
+        with pytest.raises(ValueError, match=f"(?s)fill in your own.*{name} = "):
+            package_plugin.package(tmp_path / "plugin.zip", publish=True, root=tmp_path)
+        assert not (tmp_path / "plugin.zip").exists()
+        return
+    made = package_plugin.package(tmp_path / "plugin.zip", publish=True, root=tmp_path)
+    text = zipfile.ZipFile(made).read(f"{NAME}/metadata.txt").decode("utf-8")
+    assert f"\n{name}={value}\n" in text and text.count("tracker=") == 1
+
+
+def test_verb_refuses_to_publish_what_is_here() -> None:
+    command = [sys.executable, str(ROOT / "bootstrap.py"), "package", "--publish"]
+    ran = subprocess.run(command, capture_output=True, text=True)
+    examples = re.search(r"\.example", (ROOT / "publisher.cfg").read_text(encoding="utf-8"))
+    assert (ran.returncode == 1 and "fill in your own" in ran.stderr) if examples else ran.returncode == 0
 
 
 def test_sources_keep_to_the_rules(archive: zipfile.ZipFile) -> None:
@@ -86,21 +129,9 @@ def test_sources_keep_to_the_rules(archive: zipfile.ZipFile) -> None:
             assert not {part.split(".")[0] for part in imported} & {"PyQt5", "PyQt6", "PySide6", "pickle"}, name
 
 
-def test_enums_are_fully_qualified(archive: zipfile.ZipFile) -> None:
-    """Qt 6 knows no other way: Class.Enum.Member."""
-    short = re.compile(
-        r"\b(?:QgsProcessing\.Type|QgsProcessingParameter\w+\.(?:Folder|File|Integer|Double|Flag[A-Z])"
-        r"|QgsWkbTypes\.(?:Point|Polygon|NoGeometry)|QgsFeatureSink\.FastInsert|QgsProcessingAlgorithm\.Flag[A-Z]"
-        r"|Qt\.[A-Z]\w+\b(?!\.))"
-    )
-    for name in archive.namelist():
-        if re.match(rf"{NAME}/(plugin|processing_algorithms)/.*\.py", name):
-            assert not short.search(archive.read(name).decode("utf-8")), name
-
-
 def test_what_qgis_imports_is_python_3_9(archive: zipfile.ZipFile) -> None:
     """QGIS 3.22 brings Python 3.9 on Windows and macOS."""
-    core = "|".join(("__init__", "errors", "option_fields", "options", "protocol", "files/las_index"))
+    core = "|".join(("__init__", "errors", "option_fields", "options", "protocol", "files/atomic", "files/las_index"))
     own = re.compile(rf"{NAME}/(__init__\.py|(plugin|processing_algorithms)/.*\.py|core/onthefly3r/({core})\.py)")
     read = [name for name in archive.namelist() if own.fullmatch(name)]
     assert len(read) > 20

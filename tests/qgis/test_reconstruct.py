@@ -11,7 +11,7 @@ import pytest
 from maps import render, seen_at
 
 HEAVY = {"PIL", "cv2", "gtsam", "laspy", "numpy", "pycolmap", "pyproj", "scipy", "shapefile", "torch", "typer"}
-LIGHT = {"files", "las_index"}
+LIGHT = {"files", "atomic", "las_index"}
 
 
 def test_qgis_process_runs_it(qgis_process: Any, survey: Path, tmp_path: Path) -> None:

@@ -252,6 +252,7 @@ def _run(job: Job, follow: Callable[[Event], None], cancel: Callable[[], bool] |
             encoding="utf-8",
             errors="replace",
             env={**os.environ, "PYTHONPATH": str(SOURCE), "PYTHONUTF8": "1"},
+            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
         )
         reader = threading.Thread(target=read, args=(process.stdout,), daemon=True)
         reader.start()

@@ -201,6 +201,7 @@ def _run_python(script: str, *arguments: str) -> subprocess.CompletedProcess[str
             timeout=IMPORT_LIMIT_S,
             check=False,
             stdin=subprocess.DEVNULL,
+            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
         )
     except subprocess.TimeoutExpired:
         return None

@@ -7,10 +7,13 @@ import errno
 import os
 import secrets
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+WINDOWS = os.name == "nt"
+LOCKED_WAITS_S = (0.05, 0.1, 0.2, 0.4, 0.8, 1.5)
 _NO_FOLDER_SYNC = (errno.EINVAL, errno.EBADF, errno.ENOTSUP, errno.EACCES)  # on some network drives
 
 
@@ -36,12 +39,27 @@ def replacing(path: Path, companions: Sequence[str] = ()) -> Iterator[Path]:
         for suffix in written:
             sync_file(temporary.with_suffix(suffix))
         for suffix in written:
-            temporary.with_suffix(suffix).replace(path.with_suffix(suffix))
+            replace_file(temporary.with_suffix(suffix), path.with_suffix(suffix))
         sync_folder(path.parent)
     finally:
         for suffix in suffixes:
             with contextlib.suppress(OSError):  # what ended the block is to be heard, not this
                 temporary.with_suffix(suffix).unlink(missing_ok=True)
+
+
+def replace_file(source: Path, target: Path) -> None:
+    """Rename a file over whatever has its final name.
+
+    Windows refuses that while another program has the file open, as virus scanners, indexers and previews do for a
+    moment: it is tried again for three seconds. Raises `OSError` when it cannot be done.
+    """
+    for wait_s in LOCKED_WAITS_S if WINDOWS else ():
+        try:
+            source.replace(target)
+            return
+        except PermissionError:
+            time.sleep(wait_s)
+    source.replace(target)
 
 
 def write_text(path: Path, text: str) -> None:

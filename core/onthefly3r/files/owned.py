@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import InputError, StorageError
-from .atomic import sync_file, sync_folder
+from .atomic import replace_file, sync_file, sync_folder
 from .lock import LOCK_NAME, FolderLock
 from .ownership import STAMP_NAME, WORK, Listed, Move, Publication, Stamp, fingerprint, read_stamp
+from .path_length import require_short
 from .room import require_access, require_room, storage_error, storage_errors
 
 if TYPE_CHECKING:
@@ -77,6 +78,7 @@ class OwnedFolder:
     @classmethod
     def require(cls, path: Path, names: Iterable[str] = (), guest: bool = False) -> Stamp | None:
         """Raise as `claim` does for what can be told without a write; return the folder's stamp."""
+        require_short(Path(path))
         stamp = cls._look(Path(path), names, guest)
         require_access(Path(path))
         return stamp
@@ -195,16 +197,16 @@ class OwnedFolder:
                 if os.path.lexists(target):
                     kept = backup / f"{number:06d}"
                     kept.parent.mkdir(parents=True, exist_ok=True)
-                    target.replace(kept)
+                    replace_file(target, kept)
                     done.append((kept, target))
                 if source is not None:
                     target.parent.mkdir(parents=True, exist_ok=True)
-                    source.replace(target)
+                    replace_file(source, target)
                     done.append((target, source))
         except OSError as error:
             if undo:
                 for now, before in reversed(done):
-                    now.replace(before)
+                    replace_file(now, before)
                 self.stamp.publication = None
                 self.drop_scratch(publication.backup)
             raise StorageError(
