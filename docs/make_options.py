@@ -22,7 +22,7 @@ names, defaults, units and bounds. On the command line a name has dashes (`--see
 def page() -> str:
     """Return the whole page."""
     sys.path.insert(0, str(ROOT / "core"))
-    from onthefly3r.options import PAPER_VALUES, slice_classes
+    from onthefly3r.options import PAPER_NOTES, PAPER_VALUES, slice_classes
 
     parts = [HEAD]
     for name, options_class in slice_classes().items():
@@ -33,6 +33,8 @@ def page() -> str:
         parts.append("")
     parts.append("## What the preset `paper` changes\n")
     parts += [f"- `--{name.replace('_', '-')}`: {shown(value)}" for name, value in PAPER_VALUES.items()]
+    parts.append("\nWhat it does not say by itself:\n")
+    parts += [f"- {note}" for note in PAPER_NOTES]
     return "\n".join(parts) + "\n"
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from onthefly3r.simulate.oracle import Faults
+from onthefly3r.simulate.oracle import Faults, Noise
 from oracle_runs import NO_GPS, Outcome, gap_between_cloud_and_cameras_px, run, survey_of
 
 MISPLACED_M, MISPLACED_DEG = 5.0, 5.0
@@ -123,3 +123,21 @@ def test_leftovers_carry_stage_reason_and_numbers(tmp_path: Path) -> None:
         assert np.isfinite(rejection.numbers["overlap_points"])
         assert engine.retries[index] >= engine.options.registration.max_retries
     assert outcome.worst_m < MISPLACED_M
+
+
+def test_the_papers_preset_follows_a_sound_survey_in_order(tmp_path: Path) -> None:
+    outcome = run(tmp_path, survey_of(100, 5), noise=Noise(bend_m=0.3), preset="paper")
+    asked = [subset.new for subset, _ in outcome.backbone.asked]
+    assert asked[0] == tuple(range(30))  # the first images that hang together, not the densest group
+    assert outcome.coverage == 1.0 and outcome.ate_m < 1.0
+    edges = {(e.source, e.target) for e in outcome.engine.state.frame_edges}
+    assert {(a, b) for a in range(30) for b in range(a + 1, 30)} <= edges
+    ((before_m, after_m),) = [(b, a) for b, a in outcome.optimised if b != a]
+    assert after_m < before_m
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_fixed_batches_begin_with_the_first_images(tmp_path: Path, live: bool) -> None:
+    outcome = run(tmp_path, survey_of(60, 4), batching="fixed", live=live)
+    assert outcome.backbone.asked[0][0].new == tuple(range(30))
+    assert outcome.backbone.asked[1][0].new == tuple(range(30, 35))

@@ -46,3 +46,20 @@ def test_the_length_of_a_token_does_not_matter() -> None:
     views = views_with({3: 1.5})
     longer = {i: replace(v, tokens=v.tokens * (i + 1)) for i, v in views.items() if v.tokens is not None}
     assert incompatible_references(SUBSET, longer, 3) == (3,)
+
+
+def test_the_new_images_outvote_a_majority_of_bad_references() -> None:
+    views = views_with({0: 1.5, 2: 2.0, 3: 3.0})
+    assert set(incompatible_references(SUBSET, views, 2)) == {0, 2, 3}
+    assert len(incompatible_references(SUBSET, views, 3)) == 2
+    assert set(incompatible_references(replace(SUBSET, new=(10,)), views, 2)) == {0, 2, 3}
+
+
+def test_one_bad_new_image_of_three_does_not_cost_a_good_reference() -> None:
+    subset = Subset((0, 1, 2, 3), (4, 10, 11))
+    assert incompatible_references(subset, views_with({10: 2.0}), 3) == ()
+    assert incompatible_references(subset, views_with({10: 2.0, 2: 2.0}), 3) == (2,)
+
+
+def test_references_like_the_new_images_all_stay() -> None:
+    assert incompatible_references(SUBSET, views_with({}), 1) == ()

@@ -14,7 +14,7 @@ from onthefly3r.map.store import Store
 from onthefly3r.options import RegistrationOptions
 from onthefly3r.records import Frame, LocalModel, NewFrame, Rejection, Submap, Subset
 from onthefly3r.registration.references import compact_reference, scene_spacing
-from onthefly3r.registration.register import Registration, check_seed, frame_edges, register
+from onthefly3r.registration.register import Registration, check_seed, frame_edges, register, seed_edges
 from synthetic_models import MAP_FROM_LOCAL, local_model, misplaced, moved, true_view, world_from_cam
 
 OPTIONS = RegistrationOptions()
@@ -185,6 +185,23 @@ def test_frame_edges_of_the_papers_graph(state: MapState) -> None:
         assert np.linalg.norm(e.source_from_target.translation - true.translation) < 0.3
         assert rotation_angle_deg(e.source_from_target.rotation @ true.rotation.T) < 0.2
         assert 0.0 < e.sigma_translation < 1.0 and e.sigma_rotation_rad > 0.0
+
+
+def test_a_seed_has_an_edge_between_every_two_of_its_frames() -> None:
+    model = local_model(SUBSET.members)
+    edges = seed_edges(model.views, SUBSET.members, 0.5)
+    members = SUBSET.members
+    assert [(e.source, e.target) for e in edges] == [(a, b) for k, a in enumerate(members) for b in members[k + 1 :]]
+    poses = {i: view.local_from_cam for i, view in model.views.items()}
+    depths = [view.local_from_cam.inverse().apply(view.points.astype(float))[..., 2] for view in model.views.values()]
+    for e in edges:
+        assert e.kind == "batch"
+        np.testing.assert_allclose((poses[e.source] @ e.source_from_target).matrix(), poses[e.target].matrix())
+        assert e.sigma_translation == pytest.approx(e.sigma_rotation_rad * float(np.nanmedian(depths)), rel=0.2)
+    precise = edges[0].sigma_rotation_rad
+    bad = {i: misplaced(i, 3.0, 2.0) for i in members[::2]}
+    vague = seed_edges(local_model(members, bad=bad).views, members, 0.5)[0].sigma_rotation_rad
+    assert vague > 2.0 * precise > 0.0
 
 
 def test_continuity_needs_retrieval_and_plausible_motion(state: MapState, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from onthefly3r.selection import seed as seed_module
-from onthefly3r.selection.seed import choose_seed
+from onthefly3r.selection.seed import choose_first_seed, choose_seed
 
 
 class Plane:
@@ -62,3 +62,30 @@ def test_of_many_images_only_some_are_looked_at_as_starts() -> None:
 
     assert len(choose_seed(range(1000), similarities, 10, frozenset())) == 10
     assert asked[0] == seed_module.MAX_STARTS and set(asked[1:]) == {1}
+
+
+def test_the_papers_seed_is_the_first_images_that_hang_together() -> None:
+    dense = np.vstack([grid(20, 1), grid(8, 8, 0.2) + 50.0])
+    assert min(choose_seed(range(84), Plane(dense), 12, frozenset())) >= 20
+    assert choose_first_seed(range(84), Plane(dense), 12, frozenset()) == tuple(range(12))
+
+
+def test_the_papers_seed_leaves_out_what_arrives_in_between_from_elsewhere() -> None:
+    places = np.zeros((40, 2))
+    places[::2], places[1::2] = grid(20, 1), grid(20, 1) + 50.0  # two drones in turn
+    assert choose_first_seed(range(40), Plane(places), 12, frozenset()) == tuple(range(0, 24, 2))
+
+
+def test_the_papers_seed_passes_over_groups_that_are_too_small_and_starts_that_were_refused() -> None:
+    places = np.vstack([grid(6, 1) + 90.0, grid(20, 1)])
+    assert choose_first_seed(range(26), Plane(places), 12, frozenset()) == tuple(range(6, 18))
+    assert choose_first_seed(range(26), Plane(places), 12, frozenset(range(8)))[0] in (6, 8)
+    assert choose_first_seed(range(6), Plane(places), 12, frozenset()) == tuple(range(6))
+    assert choose_first_seed([], Plane(places), 12, frozenset()) == ()
+    assert choose_first_seed(range(26), Plane(places), 12, frozenset(range(26))) == ()
+
+
+def test_the_papers_seed_takes_one_of_two_copies() -> None:
+    places = np.repeat(grid(20, 1), 2, axis=0)
+    chosen = choose_first_seed(range(40), Plane(places), 8, frozenset(), lambda a, b: a // 2 == b // 2)
+    assert len({i // 2 for i in chosen}) == 8

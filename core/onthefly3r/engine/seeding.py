@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from ..geometry.transforms import Sim3
 from ..records import Rejection, Submap, Subset
 from ..registration.references import scene_spacing
-from ..registration.register import check_seed
-from ..selection.seed import choose_seed, hanging_together
+from ..registration.register import check_seed, seed_edges
+from ..selection.seed import choose_first_seed, choose_seed, hanging_together
 from .drift import Drift
 from .workbench import Workbench
 
@@ -41,7 +41,11 @@ class Seeds:
             # Attempts after the first few are smaller: a small group may hang together where a large one does not.
             wanted = size if len(self.refused) < SEED_ATTEMPTS else max(5, size // 3)
             refused = frozenset(self.refused)
-            seed = choose_seed(bench.waiting, bench.index.similarities, wanted, refused, bench.near_copies)
+            in_order = bench.options.selection.in_order
+            choose = choose_first_seed if in_order else choose_seed
+            seed = choose(bench.waiting, bench.index.similarities, wanted, refused, bench.near_copies)
+            if in_order and len(seed) < wanted and not finishing:
+                return False  # images that hang together with these may still arrive
             if self.refused and bench.options.registration.fragments:  # the photographs may be of several places
                 seed = hanging_together(seed, bench.waiting, bench.index.similarities)
             if len(seed) < 3 or len(self.refused) > 3 * SEED_ATTEMPTS:
@@ -95,6 +99,8 @@ class Seeds:
             return False
         number = bench.state.next_submap()
         bench.state.set_spacing(spacing, number)
-        bench.commit(model, Submap(number, Sim3(), (), (), fragment=number), good)
+        is_papers_graph = bench.options.pose_graph.pose_graph == "se3"
+        edges = seed_edges(model.views, good, bench.threshold) if is_papers_graph else ()
+        bench.commit(model, Submap(number, Sim3(), (), (), edges, fragment=number), good)
         self._drift.optimise(number)
         return True

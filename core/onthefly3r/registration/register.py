@@ -27,6 +27,7 @@ from .align import align
 from .geometric import only, prune_references
 from .references import correspond
 from .validate import (
+    DEPTH_TOLERANCE,
     LEAST_MISFIT,
     MISFIT_GATE,
     PoseResidual,
@@ -178,6 +179,31 @@ def check_seed(views: Mapping[int, LocalView], min_confidence: float) -> dict[in
         rejected[worst.index] = Rejection((worst.index,), "seed", reason, numbers)
         del samples[worst.index]
     return rejected
+
+
+def seed_edges(
+    views: Mapping[int, LocalView], accepted: Sequence[int], min_confidence: float
+) -> tuple[FrameEdge, ...]:
+    """Return the edges within the batch (Eq. 15) of a first model, which is the map.
+
+    There is no alignment that could tell their weight: it follows how far the depth of the views misses the points of
+    all others, which their poses and depths share.
+    """
+    samples = {i: _sample(views[i], min_confidence, seed=i) for i in accepted}
+    misfits = []
+    for index in accepted:
+        others = np.vstack([points for i, points in samples.items() if i != index])
+        misfits.append(validate_query(index, views[index], Sim3(), others, min_confidence).misfit)
+    known = [misfit for misfit in misfits if np.isfinite(misfit)]
+    sigma_rad = max(float(np.median(known)) if known else DEPTH_TOLERANCE, 1e-4)
+    depths = [views[i].local_from_cam.inverse().apply(points)[:, 2] for i, points in samples.items()]
+    sigma = sigma_rad * float(np.median(np.concatenate(depths)))
+    poses = {i: views[i].local_from_cam for i in accepted}
+    return tuple(
+        FrameEdge(a, b, poses[a].inverse() @ poses[b], sigma_rad, sigma, "batch")
+        for k, a in enumerate(accepted)
+        for b in accepted[k + 1 :]
+    )
 
 
 def _sample(view: LocalView, min_confidence: float, seed: int, count: int = 200) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The seed: N0 retrieval-connected images (paper Sec. III-B), grown as one blob around its best-connected image."""
+"""The seed: N0 retrieval-connected images (paper Sec. III-B), the best-connected blob or the first that arrived."""
 
 from __future__ import annotations
 
@@ -63,6 +63,53 @@ def choose_seed(
         new = similarities(candidates, [candidates[best]])
         links = np.sort(np.column_stack([links, new]), axis=1)[:, 1:]
     return tuple(candidates[i] for i in chosen)
+
+
+def choose_first_seed(
+    candidates: Sequence[int],
+    similarities: Callable[[Sequence[int], Sequence[int]], Float],
+    size: int,
+    avoid: frozenset[int],
+    is_copy: Callable[[int, int], bool] | None = None,
+) -> tuple[int, ...]:
+    """Return the first `size` candidates that retrieval connects, in their order: the paper's seed (Sec. III-B).
+
+    It begins at the first candidate and always takes the earliest one that is among the nearest neighbours of an
+    image that it holds. Where a group ends before it has `size` images, later groups are tried; the largest is
+    returned if none has enough.
+
+    Args:
+        candidates: shot indices in order of arrival.
+        similarities: (first, second) -> similarities (Eq. 4) of all pairs.
+        size: N0.
+        avoid: starts that were tried before and refused.
+        is_copy: whether two images are nearly the same picture; of those only the first joins.
+    """
+    count = min(CONNECTING_NEIGHBOURS, len(candidates) - 1)
+    wanted = min(size, len(candidates))
+    best: list[int] = []
+    looked_at: set[int] = set()
+    for start in range(len(candidates)):
+        if start in looked_at or candidates[start] in avoid:
+            continue
+        group: list[int] = []
+        reached = {start}
+        passed: set[int] = set()  # copies of what the group holds, and members
+        while reached - passed and len(group) < wanted:
+            row = min(reached - passed)
+            passed.add(row)
+            if is_copy is not None and any(is_copy(candidates[row], candidates[member]) for member in group):
+                continue
+            group.append(row)
+            affinity = similarities([candidates[row]], candidates)[0]
+            affinity[row] = -np.inf
+            reached |= set(np.argpartition(affinity, -count)[-count:].tolist() if count else [])
+        looked_at |= passed
+        if len(group) > len(best):
+            best = group
+        if len(best) == wanted:
+            break
+    return tuple(candidates[row] for row in sorted(best))
 
 
 def hanging_together(
