@@ -427,7 +427,7 @@ PAPER_VALUES: dict[str, Any] = {
 PAPER_NOTES = (
     "The first reconstruction takes the first N0 images that retrieval connects, in order of arrival "
     "(`--lookahead 1`), and its cameras have edges among themselves in the SE(3) graph.",
-    "Each image keeps up to 5,000 reference points, but an alignment uses at most 500 of each reference, evenly spread.",
+    "Each image keeps up to 5,000 reference points, but an alignment uses at most 500 of each, evenly spread.",
     "tau_s (`--min-similarity`) is 0: the paper gives no value. An image joins a batch by the references it shares.",
     "The descriptor stays `vlad` and the local reconstructor `classical`, which need no download. The paper's are "
     "SupScene and Pi3X: `--descriptor supscene --backbone pi3x` with their weights.",

@@ -19,9 +19,9 @@ def incompatible_references(subset: Subset, views: Mapping[int, LocalView], min_
     """Return the references to drop, least compatible first, leaving at least `min_references`.
 
     A reference is incompatible when its usual token distance (1 - cosine) to the new images exceeds what these have
-    among themselves by `OUTLIER_Z` robust standard deviations (paper Sec. III-E, contextual pruning). The other references
-    are no measure: most of them may be wrong. A single new image has only the reference nearest to it to compare
-    with. Empty when the backbone gives no tokens.
+    among themselves by `OUTLIER_Z` robust standard deviations (paper Sec. III-E, contextual pruning). The other
+    references are no measure: most of them may be wrong. A single new image has only the reference nearest to it to
+    compare with. Empty when the backbone gives no tokens.
     """
     references = [i for i in subset.references if i in views and views[i].tokens is not None]
     new = [i for i in subset.new if i in views and views[i].tokens is not None]

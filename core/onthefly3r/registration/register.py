@@ -181,9 +181,7 @@ def check_seed(views: Mapping[int, LocalView], min_confidence: float) -> dict[in
     return rejected
 
 
-def seed_edges(
-    views: Mapping[int, LocalView], accepted: Sequence[int], min_confidence: float
-) -> tuple[FrameEdge, ...]:
+def seed_edges(views: Mapping[int, LocalView], accepted: Sequence[int], min_confidence: float) -> tuple[FrameEdge, ...]:
     """Return the edges within the batch (Eq. 15) of a first model, which is the map.
 
     There is no alignment that could tell their weight: it follows how far the depth of the views misses the points of
