@@ -135,3 +135,43 @@ def test_photographs_that_are_gone_are_not_promised(qgis: Any, plugin: Any, fold
     assert survey.photographs_folder(folder) is None
     assert survey.survey_title(folder, None) == "out"
     assert survey.photographs_folder(folder / "nothing") is None
+
+
+def test_sample_flight_hands_over_its_results(
+    qgis: Any, plugin: Any, tmp_path: Path, project: Any, feedback: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All but the computation: what `onthefly3r demo` leaves is made by hand."""
+    out, jobs = tmp_path / "sample", []
+
+    def run_job(python: str, job: Any, listener: Any, variables: Any) -> dict[str, Any]:
+        jobs.append(job)
+        make_run(out / "result", out / "photos", geopackage=False)
+        return {"accuracy": {"ate_m": 0.05, "cloud_fitted_m": 0.04}}
+
+    monkeypatch.setattr(plugin("processing_algorithms.base"), "run_job", run_job)
+    told = qgis.runAndLoadResults("onthefly3r:sampleflight", {"OUTPUT": str(out)}, feedback=feedback)
+    assert (jobs[0].verb, jobs[0].arguments) == ("demo", (str(out),))
+    assert (told["CAMERA_ERROR"], told["CLOUD_ERROR"], told["PLACED"]) == (0.05, 0.04, 2)
+    assert told["ORTHOPHOTO"] == str(out / "result" / "orthophoto.tif") and told["GEOPACKAGE"] is None
+    assert [node.name() for node in nodes(project)][:2] == ["Rejected photographs", "Cameras"]
+    assert plugin("plugin.settings").recent_runs()[0] == str(out / "result")
+
+
+def test_results_are_not_loaded_where_that_is_not_wanted(
+    qgis: Any, plugin: Any, tmp_path: Path, photos: Path, project: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The output folder that nobody named lies beside the photographs, and says so."""
+    made: list[Path] = []
+
+    def run_job(python: str, job: Any, listener: Any, variables: Any) -> dict[str, Any]:
+        made.append(make_run(Path(job.arguments[1]), photos, geopackage=True))
+        return {}
+
+    survey = photos.parents[1]
+    (survey / "photos").mkdir(parents=True)
+    monkeypatch.setattr(plugin("processing_algorithms.base"), "run_job", run_job)
+    told = qgis.runAndLoadResults(
+        "onthefly3r:reconstruct", {"PHOTOS": str(survey / "photos"), "LOAD_RESULTS": False, "QUALITY": 0}
+    )
+    assert Path(told["OUTPUT"]) == made[0] == survey / f"{survey.name} reconstructed"
+    assert not project.mapLayers() and "CAMERAS" not in told
