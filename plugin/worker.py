@@ -77,7 +77,9 @@ def run_job(python: str, job: Job, listener: Listener, variables: Mapping[str, s
             raise _failure(f"{python} cannot be started ({error.strerror}): {SETUP}.", command, None, "") from error
     if ended.cancelled:
         raise WorkerCancelled
-    if ended.returncode == 0 and "result" in told:
+    if "result" in told and (ended.returncode == 0 or "error" in told):
+        if "error" in told:  # a batch in which some flights failed: the others are there
+            listener.event(Event("warning", told["error"]))
         return told["result"]
     message = explain(ended.returncode, told.get("error", {}).get("message"), ended.error_text)
     raise _failure(message, [*command, *job.words()], ended.returncode, ended.error_text)

@@ -66,6 +66,6 @@
   </renderer-v2>
   <blendMode>0</blendMode>
   <featureBlendMode>0</featureBlendMode>
-  <mapTip>&lt;b>[% "image" %]&lt;/b>&lt;br>[% "stage" %]: [% "reason" %]&lt;br>[% if("path" IS NULL, '', '&lt;img width="320" src="file://' || if(left("path", 1) = '/', '', '/') || replace(replace(replace("path", '\\', '/'), '%', '%25'), map('#', '%23', '?', '%3F', ' ', '%20', '"', '%22')) || '">') %]</mapTip>
+  <mapTip>&lt;b>[% "image" %]&lt;/b>&lt;br>[% coalesce(attribute('stage') || ': ', '') %][% "reason" %]&lt;br>[% if("path" IS NULL, '', '&lt;img width="320" src="file://' || if(left("path", 1) = '/', '', '/') || replace(replace(replace("path", '\\', '/'), '%', '%25'), map('#', '%23', '?', '%3F', ' ', '%20', '"', '%22')) || '">') %]</mapTip>
   <layerGeometryType>0</layerGeometryType>
 </qgis>

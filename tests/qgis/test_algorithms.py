@@ -114,6 +114,7 @@ def test_many_flights(qgis: Any, survey: Path, feedback: Any, tmp_path: Path) ->
     assert rows["fails"]["status"] == "failed" and "overlap too little" in rows["fails"]["message"]
     assert rows["flies"]["status"] == "done" and rows["flies"]["placed"] == 12
     assert any("fails: failed" in text for text in feedback.told)
+    assert sum("1 of 2 flights failed" in text for text in feedback.told) == 1
     report = json.loads((tmp_path / "out" / "flies" / "report.json").read_text(encoding="utf-8"))
     assert report["software"]["options"]["working_px"] == 500
     with Path(ran["FLIGHTS_CSV"]).open(encoding="utf-8") as stream:
