@@ -65,6 +65,9 @@ def _tables(folder: Path, geopackage: bool) -> None:
     else:
         tables = {"cameras": (points, placed + refused, at)}
     tables["footprints"] = (ground, [("a.jpg", 1, 0.02, 5)], [square])
+    if not geopackage:  # their cameras do not tell the stage
+        uri, rows, places = tables["cameras"]
+        tables["cameras"] = (uri.replace("&field=stage:string", ""), [(*row[:2], *row[3:]) for row in rows], places)
     for name, (uri, rows, places) in tables.items():
         layer = QgsVectorLayer(uri, name, "memory")
         for row, place in zip(rows, places, strict=False):

@@ -75,6 +75,17 @@ def test_a_click_on_a_camera_shows_its_photograph(loaded: Any, photos: Path) -> 
         assert not QImage(QUrl(address).toLocalFile()).isNull()
 
 
+def test_map_tip_tells_why_a_photograph_was_rejected(loaded: Any, folder: Path) -> None:
+    from qgis.core import QgsExpression, QgsExpressionContext, QgsExpressionContextUtils
+
+    rejected = nodes(loaded)[0].layer()
+    context = QgsExpressionContext(QgsExpressionContextUtils.globalProjectLayerScopes(rejected))
+    context.setFeature(next(rejected.getFeatures()))
+    tip = QgsExpression.replaceExpressionText(rejected.mapTipTemplate(), context)
+    assert "c.jpg" in tip and "blurred" in tip and "[%" not in tip
+    assert ("queries" in tip) == ("stage" in [field.name() for field in rejected.fields()])
+
+
 def test_layers_are_styled_and_painted(loaded: Any) -> None:
     from maps import render
     from qgis.core import QgsRectangle
