@@ -29,15 +29,26 @@ ICONS = ROOT / "resources" / "icons"
 
 Stages = Mapping[str, tuple[int, int]]
 
-# Where each stage of a run begins and ends on the bar, in per cent; measured on surveys of 20 to 170 photographs.
+# Where each stage of a run begins and ends on the bar, in per cent: about its share of the time.
 RUN_STAGES: Stages = {
-    "reading photographs": (0, 20),
-    "starting the map": (20, 27),
-    "reconstructing": (27, 77),
-    "refining the cameras": (77, 84),
-    "georeferencing": (84, 85),
-    "collecting points": (85, 90),
-    "fusing the cloud": (90, 99),
+    "reading photographs": (0, 12),
+    "starting the map": (12, 18),
+    "reconstructing": (18, 50),
+    "starting another part of the map": (18, 50),
+    "joining parts of the map": (18, 50),
+    "refining the cameras": (50, 54),
+    "georeferencing": (54, 55),
+    "collecting points": (55, 66),
+    "reading photographs again": (55, 58),
+    "matching depths": (58, 66),
+    "comparing depths": (66, 70),
+    "aligning depths": (70, 71),
+    "averaging depths": (71, 74),
+    "making points": (74, 78),
+    "fusing the cloud": (78, 82),
+    "writing the cloud": (82, 86),
+    "comparing colours": (86, 88),
+    "orthophoto": (88, 99),
 }
 # What people look for who do not know the name.
 TAGS = (
@@ -45,7 +56,11 @@ TAGS = (
     "las", "laz", "copc", "point cloud", "orthophoto", "orthomosaic", "dem", "dsm", "dtm", "camera", "gps", "rtk",
     "ground control", "gcp", "colmap", "photographs", "images", "3d",
 )  # fmt: skip
-EXPORT_STAGES: Stages = {"collecting points": (0, 50), "fusing the cloud": (50, 99)}
+EXPORT_STAGES: Stages = {  # the same from the georeferencing on, over the whole bar
+    name: (round((begin - 54) * 2.2), round((end - 54) * 2.2))
+    for name, (begin, end) in RUN_STAGES.items()
+    if begin >= 54
+}
 
 
 def tr(text: str) -> str:
@@ -60,6 +75,7 @@ class FeedbackListener:
         self._feedback = feedback
         self._stages = stages
         self._stage = ""
+        self._percent = 0.0
         self._time_left = TimeLeft()
         self.told: set[str] = set()  # warnings, each of which is told once
 
@@ -86,12 +102,14 @@ class FeedbackListener:
 
     def _progress(self, data: dict[str, Any]) -> None:
         stage, done, total = str(data.get("stage", "")), data.get("done", 0), data.get("total", 0)
-        begin, end = self._stages.get(stage, (0, 100))
+        whole_bar = (0, 100) if not self._stages else None
+        begin, end = self._stages.get(stage) or whole_bar or (self._percent, self._percent)
         left = ""
         if total:
             percent = begin + (end - begin) * min(1.0, done / total)
-            left = self._time_left.text(percent / 100.0)
-            self._feedback.setProgress(percent)
+            self._percent = max(self._percent, percent)  # the bar never goes back
+            left = self._time_left.text(self._percent / 100.0)
+            self._feedback.setProgress(self._percent)
         counts = [(data.get("placed"), tr("placed")), (data.get("rejected"), tr("rejected"))]
         counts_text = ", ".join(f"{count} {word}" for count, word in counts if count)
         text = f"{stage}: {data['message']}" if data.get("message") else f"{stage} {done}/{total}"

@@ -32,9 +32,9 @@ QUALITY, CRS, OPTIONS = "QUALITY", "CRS", "OPTIONS"
 # Those of options that name a file of the user.
 FILES = ("POSITIONS", "CONTROL")
 
-# The presets set these; whoever names one of them among the further options overrides the preset.
-QUALITIES: dict[str, dict[str, int]] = {
-    "preview": {"working_px": 600, "dense_px": 250, "features": 2000},
+# A quality sets these beside the core's own option of that name; further options go before them.
+QUALITIES: dict[str, dict[str, Any]] = {
+    "preview": {"working_px": 600, "dense_px": 250, "features": 2000, "orthophoto": "fast"},
     "standard": {},
     "full": {"working_px": 1600, "dense_px": 1000, "features": 8000},
 }
@@ -233,7 +233,8 @@ def options_from(
         value = _value(algorithm, definition, parameters, context)
         if value is None or value == AS_BEFORE:
             continue
-        if value != item.default or every or parameters.get(definition.name()) is not None:
+        given = parameters.get(definition.name()) is not None and item.name != "quality"
+        if value != item.default or every or given:
             named[item.name] = value
     crs = target_crs(algorithm, parameters, context)
     if crs:
@@ -243,7 +244,8 @@ def options_from(
             read_options(algorithm.parameterAsString(parameters, OPTIONS, context)) if takes_further(algorithm) else {}
         )
         for name in further:
-            if parameters.get(name.upper()) not in (None, "") and further[name] != named.get(name):
+            own = parameters.get(name.upper()) not in (None, "") and name != "quality"
+            if own and further[name] != named.get(name):
                 raise OptionError(
                     f"{name} is named among the further options and as a parameter of its own: name it once"
                 )

@@ -14,20 +14,18 @@ from qgis.core import (
 
 from ..core.onthefly3r.protocol import Job
 from ..plugin.places import unused
-from .base import CoreAlgorithm, Stages, tr
+from .base import RUN_STAGES, CoreAlgorithm, Stages, tr
 from .output import OUTPUT, add_output, documents_folder, require_output
 from .results import add_run_outputs, hand_over
 
 NAME = "Sample flight"
+RENDERED_AT = 20  # per cent
 STAGES: Stages = {
-    "rendering": (0, 20),
-    "reading photographs": (20, 24),
-    "starting the map": (24, 40),
-    "reconstructing": (40, 80),
-    "refining the cameras": (80, 88),
-    "georeferencing": (88, 89),
-    "collecting points": (89, 93),
-    "fusing the cloud": (93, 99),
+    "simulate": (0, RENDERED_AT),
+    **{
+        name: (RENDERED_AT + round(0.8 * begin), RENDERED_AT + round(0.8 * end))
+        for name, (begin, end) in RUN_STAGES.items()
+    },
 }
 
 

@@ -196,13 +196,12 @@ class Pictures:
             "PHOTOS": str(self.photographs),
             "QUALITY": "preview",
             "OUTPUT": str(self.work / "quarry"),
-            **{name: self._layer() for name in ("CAMERAS", "REJECTED", "FOOTPRINTS")},
         }
         processing.runAndLoadResults("onthefly3r:reconstruct", parameters)
         self._whole_map()
 
     def result_map(self) -> None:
-        """Cameras and footprints."""
+        """Cameras over the ground."""
         self._save_window("qgis-result.png")
 
     def report(self) -> None:

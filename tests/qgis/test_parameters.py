@@ -30,11 +30,11 @@ def test_nothing_named_leaves_the_defaults_of_the_core(options_of: Any) -> None:
 
 
 def test_quality_sets_sizes_and_named_ones_go_before_it(options_of: Any) -> None:
-    assert options_of("reconstruct", {"QUALITY": "preview"}) == {"working_px": 600, "dense_px": 250, "features": 2000}
-    assert options_of("reconstruct", {"QUALITY": "preview", "WORKING_PX": 1000, "OPTIONS": "dense_px=300"}) == {
-        "dense_px": 300,
-        "features": 2000,
-    }
+    preview = {"quality": "preview", "working_px": 600, "dense_px": 250, "features": 2000, "orthophoto": "fast"}
+    assert options_of("reconstruct", {"QUALITY": "preview"}) == preview
+    named = {"QUALITY": "preview", "WORKING_PX": 1000, "OPTIONS": "dense_px=300 quality=standard orthophoto=none"}
+    assert options_of("reconstruct", named) == {"dense_px": 300, "features": 2000, "orthophoto": "none"}
+    assert options_of("reconstruct", {"QUALITY": "standard", "OPTIONS": "preset=paper"}) == {"preset": "paper"}
 
 
 def test_values_have_the_types_of_the_core(options_of: Any, plugin: Any, tmp_path: Path) -> None:

@@ -106,3 +106,29 @@ def test_few_placed_photographs_are_told_first(plugin: Any) -> None:
         told(89, "tilted")[0].startswith("Only 89 of 100 photographs were placed") and told(89, "tilted")[1] == "tilted"
     )
     assert told(40, "only 40 of 100 photographs are in the result") == ["only 40 of 100 photographs are in the result"]
+
+
+def test_bar_knows_every_stage_of_the_core_and_never_goes_back(plugin: Any, feedback: Any) -> None:
+    import ast
+
+    base, event = plugin("processing_algorithms.base"), plugin("core.onthefly3r.protocol").Event
+    tellers = {"checkpoint", "_checkpoint", "_progress", "each", "Progress"}
+    core = Path(__file__).resolve().parents[2] / "core" / "onthefly3r"
+    told = {
+        call.args[0].value
+        for folder in ("engine", "cloud", "products", "run")
+        for path in (core / folder).rglob("*.py")
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(call, ast.Call) and call.args and isinstance(call.args[0], ast.Constant)
+        if ast.unparse(call.func).rpartition(".")[2] in tellers
+    }
+    assert len(told) > 8
+    assert told <= set(base.RUN_STAGES)
+    shown: list[float] = []
+    feedback.progressChanged.connect(shown.append)
+    listener = base.FeedbackListener(feedback, base.RUN_STAGES)
+    for stage in ("reading photographs", "reconstructing", "something new", "reading photographs again", "orthophoto"):
+        for done in (0, 1, 2):
+            listener.event(event("progress", {"stage": stage, "done": done, "total": 2}))
+    assert shown == sorted(shown) and shown[-1] == 99.0
+    assert all(0 <= begin < end <= 100 for begin, end in base.EXPORT_STAGES.values())
