@@ -17,7 +17,7 @@ from qgis.core import (
 )
 from qgis.PyQt.QtCore import QStandardPaths
 
-from ..plugin.places import default_output, is_free
+from ..plugin.places import LITTER, default_output, is_free
 from .base import CoreAlgorithm, tr
 from .parameters import add
 
@@ -52,9 +52,10 @@ def require_output(out: Path, photos: Path | None = None) -> Path:
     if out.exists() and not out.is_dir():
         raise QgsProcessingException(tr("The output folder {} is a file: name a folder.").format(out))
     if not is_free(out) and not (out / STAMP).is_file() and os.access(out, os.R_OK):
+        other = min(inner.name for inner in out.iterdir() if inner.name not in LITTER)
         raise QgsProcessingException(
-            tr("The output folder {} holds other files: name a new or empty one, or that of an earlier run.").format(
-                out
+            tr("The output folder {} holds {}, which is of no earlier run: name a new or empty folder.").format(
+                out, other
             )
         )
     existing = next(place for place in (out, *out.parents) if place.exists())

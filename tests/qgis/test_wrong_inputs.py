@@ -49,7 +49,7 @@ RECONSTRUCT = [
     ({**PHOTOS, "OPTIONS": "crs=EPSG:25833", "CRS": "EPSG:25832"}, "crs is named .*name it once"),
     ({**PHOTOS, "OPTIONS": "control={here}/gone.csv"}, "Ground control: .*gone.csv does not exist"),
     ({**PHOTOS, "SPACING_M": -1.0}, "spacing_m: -1.0 is below the minimum"),
-    ({**PHOTOS, "OUTPUT": "{here}/taken"}, "taken holds other files"),
+    ({**PHOTOS, "OUTPUT": "{here}/taken"}, "taken holds thesis.doc"),
     ({**PHOTOS, "OUTPUT": "{here}/file.txt"}, "file.txt is a file: name a folder"),
     ({**PHOTOS, "OUTPUT": "{here}/file.txt/out"}, "Nothing can be written into .*file.txt"),
     ({**PHOTOS, "OUTPUT": "{here}/photos"}, "output folder is that of the photographs"),
@@ -108,7 +108,7 @@ CASES = {
         ({**RUN, "REFERENCE_CLOUD": "{here}/file.txt", "CLOUD_ALIGN": 7}, "7 is none of none, poses"),
     ],
     "sampleflight": [
-        ({"OUTPUT": "{here}/taken"}, "taken holds other files"),
+        ({"OUTPUT": "{here}/taken"}, "taken holds thesis.doc"),
         ({"OUTPUT": "{here}/file.txt"}, "file.txt is a file"),
         ({"OUTPUT": "{here}/file.txt/out"}, "Nothing can be written"),
     ],
