@@ -186,35 +186,43 @@ class Joins:
 
         `references` are those that were reconstructed, `kept` those that agree with the map.
         """
-        state = self._bench.state
-        references, kept = list(references), set(kept)
+        state, kept = self._bench.state, set(kept)
+        here = [i for i in references if state.fragment_of(i) == fragment]
         for joined in [j for j in self.memory.joined if state.fragment_of_submap[min(j.submaps)] == fragment]:
+            apart = self._side_of_source(joined)
             sides = {True: 0, False: 0}
             held = {True: 0, False: 0}
-            for index in references:
-                side = state.frames[index].submap in joined.submaps
+            for index in here:
+                side = state.frames[index].submap in apart
                 sides[side] += 1
                 held[side] += index in kept
             if min(sides.values()) < 2:
                 continue
             if min(held.values()) > 0:
                 joined.confirmations += 1
-            elif max(held.values()) > 0 or not kept:
+            else:
                 joined.contradictions += 1
             if joined.contradictions >= MAX_CONTRADICTIONS + joined.confirmations:
                 self._undo(joined)
 
-    def _undo(self, joined: Joined) -> None:
-        """Part a fragment again: later submaps go with the side that most of their sightings tie them to."""
+    def _side_of_source(self, joined: Joined) -> set[int]:
+        """Return the submaps on the source's side of a join: later ones are where most of their sightings lie."""
         state = self._bench.state
-        label = state.fragment_of_submap[min(joined.submaps)]
+        label, last = state.fragment_of_submap[min(joined.submaps)], max(joined.bridges)
+        tied: dict[int, list[int]] = {}
+        for seen in state.sightings:
+            if seen.submap > last and state.fragment_of_submap[seen.submap] == label:
+                tied.setdefault(seen.submap, []).append(state.frames[seen.frame].submap)
         apart = set(joined.submaps)
-        for number in sorted(n for n, known in state.fragment_of_submap.items() if known == label):
-            if number <= max(joined.bridges) or number in joined.bridges:
-                continue
-            tied = [s.frame for s in state.sightings if s.submap == number]
-            if sum(state.frames[i].submap in apart for i in tied) * 2 > len(tied):
+        for number in sorted(tied):
+            if sum(other in apart for other in tied[number]) * 2 > len(tied[number]):
                 apart.add(number)
+        return apart
+
+    def _undo(self, joined: Joined) -> None:
+        """Part a fragment again, and let each part go on for itself."""
+        state = self._bench.state
+        label, apart = state.fragment_of_submap[min(joined.submaps)], self._side_of_source(joined)
         if any(n not in apart and n == label for n in state.fragment_of_submap):
             state.part_with(sorted(apart), joined.source)
             self._drift.forget(label)
