@@ -40,18 +40,20 @@ def default_output(
     project_folder: Path | None,
     documents: Path,
     is_writable: Callable[[Path], bool] | None = None,
+    what: str = RESULTS,
 ) -> Path:
     """Return a folder for the results that is not there yet, or is empty.
 
     It lies beside the photographs; where these are on a card or nothing can be written there, in the folder of the
-    project, else in the documents.
+    project, else in the documents. Its name ends in `what`.
     """
     writable = is_writable or can_write
     beside = photos.parent
     on_a_card = beside == beside.parent or any(part.upper() == "DCIM" for part in photos.parts)
     places = [None if on_a_card else beside, project_folder]
     parent = next((place for place in places if place is not None and writable(place)), documents / "On-the-Fly3R")
-    return unused(parent, f"{survey_name(photos)} {RESULTS}")
+    name = survey_name(photos).replace(f" {RESULTS}", "")
+    return unused(parent, f"{name} {what}")
 
 
 def unused(parent: Path, name: str) -> Path:

@@ -18,6 +18,8 @@ from .parameters import add_control, add_georeference, add_options, options_from
 from .results import add_run_outputs, hand_over
 from .survey import photographs_folder
 
+GEOREFERENCED = "georeferenced"
+
 
 class Georeference(EarlierRunAlgorithm):
     """`onthefly3r export` with other options of georeferencing."""
@@ -53,14 +55,14 @@ class Georeference(EarlierRunAlgorithm):
         named = self.parameterAsString(parameters, OUTPUT, context).strip()
         if named and Path(named).resolve() == run.resolve():
             raise QgsProcessingException(tr("The output folder is that of the run: name another one."))
-        output_folder(self, parameters, context, run)
+        output_folder(self, parameters, context, run, GEOREFERENCED)
 
     def processAlgorithm(
         self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback
     ) -> dict[str, Any]:
         """Write everything again, then fill the layers."""
         run = self.run_folder(parameters, context)
-        out = output_folder(self, parameters, context, run)
+        out = output_folder(self, parameters, context, run, GEOREFERENCED)
         options = options_from(self, parameters, context, every=True)
         self.export(run, out, options, feedback)
         return {OUTPUT: str(out), **hand_over(self, parameters, context, feedback, out, photographs_folder(run))}

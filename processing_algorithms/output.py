@@ -17,7 +17,7 @@ from qgis.core import (
 )
 from qgis.PyQt.QtCore import QStandardPaths
 
-from ..plugin.places import LITTER, default_output, is_free
+from ..plugin.places import LITTER, RESULTS, default_output, is_free
 from .base import CoreAlgorithm, tr
 from .parameters import add
 
@@ -33,13 +33,20 @@ def add_output(algorithm: CoreAlgorithm, help: str) -> None:
 
 
 def output_folder(
-    algorithm: CoreAlgorithm, parameters: dict[str, Any], context: QgsProcessingContext, photos: Path
+    algorithm: CoreAlgorithm,
+    parameters: dict[str, Any],
+    context: QgsProcessingContext,
+    photos: Path,
+    what: str = RESULTS,
 ) -> Path:
-    """Return the folder for the results of these photographs; raises `QgsProcessingException` for one that is taken."""
+    """Return the folder for the results of these photographs; raises `QgsProcessingException` for one that is taken.
+
+    `what` ends the name of a folder that nobody named.
+    """
     named = algorithm.parameterAsString(parameters, OUTPUT, context).strip()
     if not named:
         home = (context.project() or QgsProject.instance()).homePath()
-        return default_output(photos, Path(home) if home else None, documents_folder())
+        return default_output(photos, Path(home) if home else None, documents_folder(), what=what)
     if named == QgsProcessing.TEMPORARY_OUTPUT:
         return Path(QgsProcessingUtils.generateTempFilename("reconstructed"))
     return require_output(Path(named).absolute(), photos)

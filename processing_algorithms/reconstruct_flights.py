@@ -105,7 +105,7 @@ class ReconstructFlights(CoreAlgorithm):
 
     def check(self, parameters: dict[str, Any], context: QgsProcessingContext) -> None:
         """Tell what is wrong before anything starts."""
-        output_folder(self, parameters, context, self._flights(parameters, context))
+        output_folder(self, parameters, context, _named_by(self._flights(parameters, context)))
         options_from(self, parameters, context)
 
     def processAlgorithm(
@@ -116,7 +116,7 @@ class ReconstructFlights(CoreAlgorithm):
         if self.parameterAsBoolean(parameters, SKIP_DONE, context):
             options["skip_done"] = True
         flights = self._flights(parameters, context)
-        out = output_folder(self, parameters, context, flights)
+        out = output_folder(self, parameters, context, _named_by(flights))
         require_backbone(self, options, feedback)
         feedback.pushInfo(tr("Results go to {}").format(out))
         rows = self.run_core(Job("batch", (str(flights), str(out)), options), feedback)["flights"]
@@ -145,3 +145,8 @@ class ReconstructFlights(CoreAlgorithm):
         if folder:
             return require_folder(folder, tr("Parent folder of the flights"))
         return require_file(table, tr("Table of flights"))
+
+
+def _named_by(flights: Path) -> Path:
+    """Return what the folder of results is named after: the parent folder, or the table without its ending."""
+    return flights.with_suffix("") if flights.is_file() else flights

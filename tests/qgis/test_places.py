@@ -39,6 +39,8 @@ def test_results_go_beside_the_photographs(plugin: Any, tmp_path: Path) -> None:
     assert places.default_output(photos, None, documents) == first
     (first / "report.json").write_text("{}")
     assert places.default_output(photos, None, documents).name == "quarry reconstructed 2"
+    again = places.default_output(first, None, documents, what="georeferenced")
+    assert again == tmp_path / "quarry" / "quarry georeferenced"
 
 
 def test_results_of_a_card_go_to_the_project_or_the_documents(plugin: Any, tmp_path: Path) -> None:
