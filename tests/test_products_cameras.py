@@ -31,7 +31,7 @@ def test_grid_yaw_and_convergence_give_back_the_true_yaw(crs: str, lon_deg: floa
 
 def test_rows_are_in_capture_order_whatever_order_the_shots_came_in(tmp_path: Path) -> None:
     engine = run(tmp_path, survey_of(24, 2), shuffle=3).engine
-    state, frame = engine.state, ExportFrame.of(None, None, None)
+    state, frame = engine.state, ExportFrame(Sim3(), None, False)
     placed = placed_cameras(state, engine.shots, {}, frame)
     refused = {camera.index: Rejection((), "queries", "moved") for camera in placed[:4]}
     shots = dict(engine.shots)

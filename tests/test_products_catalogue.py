@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from onthefly3r.geometry.transforms import Sim3
 from onthefly3r.options import ExportOptions, Options
 from onthefly3r.products.catalogue import PRODUCTS
 from onthefly3r.products.exportframe import ExportFrame
@@ -27,7 +28,7 @@ def view_of(folder: Path, export: ExportOptions | None = None) -> RunView:
         retries=engine.retries,
         refused=(),
         reference=None,
-        frame=ExportFrame.of(None, None, None),
+        frame=ExportFrame(Sim3(), None, False),
         work=folder / "temporary",
         checkpoint=lambda stage, done, total: None,
     )

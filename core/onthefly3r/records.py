@@ -276,6 +276,7 @@ class Submap:
     sightings: tuple[Sighting, ...]
     frame_edges: tuple[FrameEdge, ...] = ()
     calibrations: Mapping[str, Camera] = field(default_factory=dict)  # first seen here; per camera key, photograph size
+    metric: bool = False  # the local model's units are metres
     fragment: int = 0  # of the map, named by the number of its first submap: `map_from_submap` is in its frame
 
 

@@ -109,7 +109,7 @@ class Workbench:
                 new_frame(i, submap.number, model.views[i], self.images[i], self.threshold, points) for i in accepted
             ]
             placed_frames = tuple(new.frame for new in frames)
-            complete = replace(submap, frames=placed_frames, calibrations=model.calibrations)
+            complete = replace(submap, frames=placed_frames, calibrations=model.calibrations, metric=model.metric)
             self.state.commit(complete, frames, model.observations)
         placed = [new.frame.index for new in frames]
         for index in placed:

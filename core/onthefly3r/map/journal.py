@@ -103,6 +103,7 @@ def submap_to_json(submap: Submap) -> dict[str, Any]:
             for edge in submap.frame_edges
         ],
         "calibrations": {key: asdict(camera) for key, camera in submap.calibrations.items()},
+        "metric": submap.metric,
         "fragment": submap.fragment,
     }
 
@@ -143,7 +144,14 @@ def submap_from_json(value: Any) -> Submap:
     calibrations = {str(key): camera_from_json(camera) for key, camera in value["calibrations"].items()}
     pose = sim3_from_json(value["map_from_submap"])
     return Submap(
-        int(value["number"]), pose, frames, sightings, frame_edges, calibrations, int(value.get("fragment", 0))
+        number=int(value["number"]),
+        map_from_submap=pose,
+        frames=frames,
+        sightings=sightings,
+        frame_edges=frame_edges,
+        calibrations=calibrations,
+        metric=bool(value.get("metric", False)),
+        fragment=int(value.get("fragment", 0)),
     )
 
 

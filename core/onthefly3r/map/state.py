@@ -44,6 +44,7 @@ class MapState:
         self.frame_edges: list[FrameEdge] = []
         self.calibrations: dict[str, Camera] = {}
         self.fragment_of_submap: dict[int, int] = {}
+        self.metric_submaps: set[int] = set()  # those whose own units are metres
         self._spacing_of: dict[int, float] = {}  # l_scene of each fragment, in its units
         self.curvatures_of: dict[int, Float] = {}  # (3,) as last found, per unit of the submap (`bending.py`)
         self._moved: dict[int, Rigid3] = {}
@@ -83,6 +84,12 @@ class MapState:
     def spacing(self) -> float:
         """l_scene in map units, of the largest fragment; NaN before there is one."""
         return self._spacing_of.get(next(iter(self.fragments()), 0), float("nan"))
+
+    @property
+    def metres_per_unit(self) -> float | None:
+        """What metric local models say of the map's scale: the median over their submaps, None without any."""
+        scales = [self.map_from_submap[number].scale for number in self.metric_submaps]
+        return 1.0 / float(np.median(scales)) if scales else None
 
     def fragment_of(self, index: int) -> int:
         """Return the fragment that an accepted frame lies in."""
@@ -174,6 +181,8 @@ class MapState:
     def _take(self, submap: Submap) -> None:
         self.map_from_submap[submap.number] = submap.map_from_submap
         self.fragment_of_submap[submap.number] = submap.fragment
+        if submap.metric:
+            self.metric_submaps.add(submap.number)
         self.frames.update({frame.index: frame for frame in submap.frames})
         self.sightings.extend(submap.sightings)
         self.frame_edges.extend(submap.frame_edges)
@@ -220,6 +229,7 @@ class MapPart(MapState):
         self._whole = whole
         self.fragment_of_submap = {n: label for n, label in whole.fragment_of_submap.items() if label in fragments}
         self.map_from_submap = {number: whole.map_from_submap[number] for number in self.fragment_of_submap}
+        self.metric_submaps = whole.metric_submaps & set(self.map_from_submap)
         self.frames = {i: frame for i, frame in whole.frames.items() if frame.submap in self.map_from_submap}
         self.sightings = [
             seen for seen in whole.sightings if seen.submap in self.map_from_submap and seen.frame in self.frames

@@ -9,7 +9,7 @@ import numpy as np
 from ..earth.georef import world_frame
 from ..geometry.arrays import Float
 from ..geometry.geodesy import WorldFrame, wkt1
-from ..geometry.transforms import Rigid3, Sim3, nearest_rotation
+from ..geometry.transforms import Rigid3, Sim3
 from ..records import GeoReference
 
 
@@ -22,13 +22,9 @@ class ExportFrame:
     metric: bool = True  # whether the unit is the metre
 
     @classmethod
-    def of(cls, reference: GeoReference | None, up: Float | None, metres_per_map_unit: float | None) -> ExportFrame:
-        """Return the frame of a georeference; without one, the map turned so that `up` points up, and scaled."""
-        if reference is not None:
-            return cls(reference.enu_from_map, world_frame(reference))
-        return cls(
-            Sim3(metres_per_map_unit or 1.0, _turning_up(up), np.zeros(3)), None, metres_per_map_unit is not None
-        )
+    def of(cls, reference: GeoReference) -> ExportFrame:
+        """Return the frame of a georeference."""
+        return cls(reference.enu_from_map, world_frame(reference))
 
     @property
     def wkt(self) -> str | None:
@@ -57,14 +53,3 @@ class ExportFrame:
             return 0.0
         turn = self.world.rotation_world_from_enu(self.level_from_map.apply(map_from_cam.translation))
         return float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
-
-
-def _turning_up(up: Float | None) -> Float:
-    """Return the shortest rotation that brings `up` to the third axis."""
-    if up is None:
-        return np.eye(3)
-    third = np.asarray(up, float) / np.linalg.norm(up)
-    first = np.eye(3)[int(np.argmin(np.abs(third)))]
-    first = first - (first @ third) * third
-    first = first / np.linalg.norm(first)
-    return nearest_rotation(np.stack([first, np.cross(third, first), third]))

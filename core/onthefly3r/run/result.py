@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..earth.georef import metres_per_map_unit
 from ..earth.ground import ground_normal
+from ..earth.localframe import local_frame, scale_warning
 from ..errors import Cancelled, GeoreferenceError, ReconstructionError
 from ..files.las_index import indexes_beside, indexes_of
 from ..map.state import MapState
@@ -130,7 +130,6 @@ def _export(
     """
     state, record = mapped.state, mapped.record
     reference: GeoReference | None = None
-    metres_per_unit: float | None = None
     warnings = list(record.warnings)
     placed, rejected = len(state.frames), len(record.rejections) + len(record.refused)
 
@@ -151,13 +150,20 @@ def _export(
             main = main_part(state)
             poses = {index: main.map_from_cam(index) for index in main.frames}
             up = ground_normal(main)
+            stated = main.metres_per_unit
             if options.georeference.local:
-                metres_per_unit = metres_per_map_unit(poses, record.shots, options.georeference)
-                if metres_per_unit is None:
-                    warnings.append("no positions tell the scale: the units of the local frame are not metres")
+                local = local_frame(state.tie, poses, record.shots, options.georeference, up, stated)
+                frame = ExportFrame(local.level_from_map, None, local.metric)
+                reference = local.reference
+                warnings += local.warnings
             else:
                 reference = main_reference(state, record.shots, options.georeference, up)
+                frame = ExportFrame.of(reference)
+            if reference is not None and (said := scale_warning(reference, stated)):
+                warnings.append(said)
             state, reference, lost, apart = laid_out(state, record.shots, options.georeference, reference)
+            if options.georeference.local:
+                reference = None
             record = replace(record, rejections={**record.rejections, **lost})
             mapped = replace(mapped, state=state, record=record)
     with stopwatch.stage("export"):
@@ -171,7 +177,7 @@ def _export(
             retries=record.retries,
             refused=record.refused,
             reference=reference,
-            frame=ExportFrame.of(reference, up, metres_per_unit),
+            frame=frame,
             work=made.parent,
             checkpoint=checkpoint,
         )
