@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..earth.ground import ground_normal
-from ..earth.localframe import local_frame, scale_warning
+from ..earth.local_level import local_frame, scale_warning
 from ..errors import Cancelled, GeoreferenceError, ReconstructionError
 from ..files.las_index import indexes_beside, indexes_of
 from ..map.state import MapState

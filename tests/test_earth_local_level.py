@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from onthefly3r.earth.localframe import local_frame, scale_warning, turning_up
+from onthefly3r.earth.local_level import local_frame, scale_warning, turning_up
 from onthefly3r.geometry.frames import enu_from_cam_rotation
 from onthefly3r.geometry.geodesy import EnuFrame
 from onthefly3r.geometry.transforms import Rigid3, Sim3, rotation_exp
