@@ -43,6 +43,7 @@ def test_shuffled_input_fills_batches(tmp_path: Path) -> None:
     assert outcome.mean_batch >= 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shuffle", [None, 1])
 def test_images_that_arrive_one_by_one(tmp_path: Path, shuffle: int | None) -> None:
     outcome = run(tmp_path, survey_of(160, 8), live=True, shuffle=shuffle)
@@ -50,6 +51,7 @@ def test_images_that_arrive_one_by_one(tmp_path: Path, shuffle: int | None) -> N
     assert outcome.mean_batch >= 4.0
 
 
+@pytest.mark.slow
 def test_a_hundred_and_sixty_domed_local_models(tmp_path: Path) -> None:
     outcome = run(tmp_path, survey_of(160, 8), Faults(doming_m=1.0))
     check_sound(outcome, 1.0)
@@ -61,12 +63,14 @@ def test_only_the_papers_graph_leaves_the_cloud_behind_its_cameras(tmp_path: Pat
     assert gap_between_cloud_and_cameras_px(outcome) > 0.5
 
 
+@pytest.mark.slow
 def test_three_hundred_and_sixty_images_do_not_drift(tmp_path: Path) -> None:
     outcome = run(tmp_path, survey_of(360, 12))
     check_sound(outcome, 0.4)
     assert max(before for before, _ in outcome.optimised) > 1.2 * outcome.ate_m  # there was drift to remove
 
 
+@pytest.mark.slow
 def test_three_hundred_and_sixty_images_without_positions(tmp_path: Path) -> None:
     check_sound(run(tmp_path, survey_of(360, 12), **NO_GPS), 0.7)
 
@@ -105,6 +109,7 @@ def test_bad_images_of_a_seed_are_left_out_of_it(tmp_path: Path) -> None:
     assert not bad & {i for i, frame in outcome.engine.state.frames.items() if frame.submap == 0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, NO_GPS], ids=["gps", "no gps"])
 def test_look_alike_blocks_are_not_confused(tmp_path: Path, options: dict[str, bool]) -> None:
     survey = survey_of(160, 8, look_alike=True)
