@@ -44,7 +44,7 @@ def flat(noise_px: float) -> Block:
 
 def rebuilt(truth: Block, matches: dict[tuple[int, int], Int]) -> SparseModel | None:
     keys = dict.fromkeys(truth.poses, KEY)
-    return local_sfm(truth.features, keys, {KEY: CAMERA}, frozenset({KEY}), matches, threads=1)
+    return local_sfm(truth.features, keys, {KEY: CAMERA}, frozenset({KEY}), matches)
 
 
 def worst_centre(model: SparseModel, truth: Block) -> float:

@@ -13,7 +13,8 @@ from onthefly3r.selection.proposals import plane_position, propose_references
 
 def unit_rows(count: int, length: int = 24, seed: int = 0) -> np.ndarray:
     rows = np.random.default_rng(seed).standard_normal((count, length)).astype(np.float32)
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.trunc(rows * 4096) / 4096  # what the table keeps of them
 
 
 def filled(vectors: np.ndarray, accepted: list[int]) -> RetrievalIndex:
@@ -70,6 +71,21 @@ def test_similarities_of_all_pairs(first: int, second: int) -> None:
     rows, columns = list(range(first))[::-1], list(range(second))
     result = index.similarities([10 * i for i in rows], [10 * i for i in columns])
     np.testing.assert_allclose(result, vectors[rows] @ vectors[columns].T, atol=1e-6)
+
+
+def test_similarities_do_not_depend_on_how_they_are_asked_for() -> None:
+    """Of long descriptors, two of them alike, to the last bit: in blocks, one by one, and by another product."""
+    vectors = unit_rows(90, 8192)
+    vectors[1] = vectors[0]
+    index = filled(vectors, [])
+    images = [10 * i for i in range(90)]
+    every = index.similarities(images, images)
+    exact = vectors.astype(float) @ vectors.astype(float).T
+    np.testing.assert_array_equal(every, exact)
+    for i in (0, 1, 37):
+        for columns in (images, images[3:17], images[40:41]):
+            one = index.similarities([10 * i], columns)
+            np.testing.assert_array_equal(one, exact[i : i + 1, [c // 10 for c in columns]])
 
 
 @pytest.mark.parametrize("late", [False, True])

@@ -76,7 +76,7 @@ class ClassicalBackbone:
             members,
             self._checkpoint,
         )
-        model = local_sfm(features, keys, cameras, held, matches, self._threads, self._checkpoint)
+        model = local_sfm(features, keys, cameras, held, matches, self._checkpoint)
         self._checkpoint()
         if model is None:
             verified = sum(len(found) > 0 for found in matches.values())

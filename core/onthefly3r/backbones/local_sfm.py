@@ -28,7 +28,6 @@ def local_sfm(
     cameras: Mapping[str, Camera],
     held: frozenset[str],
     matches: Mapping[tuple[int, int], Int],
-    threads: int,
     checkpoint: Callable[[], None] = lambda: None,
 ) -> SparseModel | None:
     """Return the largest model of the subset, or None when no three images hold together.
@@ -46,7 +45,7 @@ def local_sfm(
     cache = _database_cache(features, keys, cameras, camera_ids, matches)
     connected = _largest_connected(matches)
     best = None
-    for attempt, options in enumerate(_attempts(threads, features, matches)):
+    for attempt, options in enumerate(_attempts(features, matches)):
         options.constant_cameras = {camera_ids[key] for key in held if key in camera_ids}
         manager = pycolmap.ReconstructionManager()
         pipeline = pycolmap.IncrementalPipeline(options, cache, manager)
@@ -98,11 +97,11 @@ def _first_pairs(features: Mapping[int, Features], matches: Mapping[tuple[int, i
     return chosen
 
 
-def _attempts(threads: int, features: Mapping[int, Features], matches: Mapping[tuple[int, int], Int]) -> Iterator[Any]:
+def _attempts(features: Mapping[int, Features], matches: Mapping[tuple[int, int], Int]) -> Iterator[Any]:
     """Yield the options of one attempt after the other."""
-    yield _pipeline_options(threads)
+    yield _pipeline_options()
     for pair in (None, *_first_pairs(features, matches)):
-        options = _pipeline_options(threads)
+        options = _pipeline_options()
         options.mapper.abs_pose_min_num_inliers = 15
         options.mapper.abs_pose_min_inlier_ratio = 0.15
         options.mapper.init_min_num_inliers = MIN_FIRST_MATCHES
@@ -150,11 +149,11 @@ def _database_cache(
     return cache
 
 
-def _pipeline_options(threads: int) -> Any:
+def _pipeline_options() -> Any:
     pycolmap = load_pycolmap()
 
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = threads
+    options.num_threads = 1  # with more, its random draws and sums differ from run to run
     options.random_seed = 0
     options.min_model_size = MIN_MODEL_SIZE
     options.multiple_models = False

@@ -1,4 +1,4 @@
-"""The command line: run, batch, check, export, evaluate, simulate, demo, doctor, view.
+"""The command line: run, resume, batch, check, export, evaluate, simulate, demo, doctor, view.
 
 Exit codes: 0 done, 2 the input is wrong, 3 nothing reconstructed or georeferenced, 4 no room or no access,
 5 fewer than half of the photographs placed, 130 cancelled, 1 unexpected.
@@ -60,16 +60,38 @@ def _root(
 def run(
     photos: Annotated[Path, typer.Argument(metavar="PHOTOS", help="folder of photographs")],
     out: Out,
+    anew: Annotated[
+        bool,
+        typer.Option("--anew", help="begin again instead of going on with a run that did not end", show_default=False),
+    ] = False,
     json: JsonLines = False,
     **values: Any,
 ) -> None:
-    """Reconstruct a folder of photographs: cloud, cameras and report in OUT."""
+    """Reconstruct a folder of photographs: cloud, cameras and report in OUT; a run that did not end goes on."""
     with session(json_lines=json, out=out) as here:
         options = run_options(values)
         _require_folder(photos, "PHOTOS")
         from ..run.session import reconstruct
 
-        result = reconstruct(photos, out, options, here.progress, here.cancelled)
+        result = reconstruct(photos, out, options, here.progress, here.cancelled, anew)
+        for warning in result.report.get("warnings", ()):
+            here.warning(warning)
+        here.result(_result_data(result), columns(_result_summary(result)))
+
+
+@app.command()
+@with_run_options()
+def resume(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a run that did not end")],
+    json: JsonLines = False,
+    **values: Any,
+) -> None:
+    """Go on with a run that was stopped or killed, from where it was; its options stay but for those named."""
+    with session(json_lines=json, out=out) as here:
+        _require_folder(out, "OUT")
+        from ..run.session import resume as resume_run
+
+        result = resume_run(out, given(values), here.progress, here.cancelled)
         for warning in result.report.get("warnings", ()):
             here.warning(warning)
         here.result(_result_data(result), columns(_result_summary(result)))

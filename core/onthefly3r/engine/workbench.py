@@ -67,7 +67,7 @@ class Workbench:
     def stop_if_cancelled(self) -> None:
         """Raise `Cancelled` when the caller asks to stop."""
         if self._cancel is not None and self._cancel():
-            raise Cancelled("stopped on request; run again to start anew")
+            raise Cancelled("stopped on request")
 
     @contextlib.contextmanager
     def optional(self, stage: str) -> Iterator[None]:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import InputError
 from ..files.array_file import ArrayFile
 from ..geometry.arrays import UInt8
 from ..records import Features, WorkingImage
@@ -88,8 +89,12 @@ class FeatureStore:
         path = self._path(index)
         if not path.exists():
             raise KeyError(index)
-        with ArrayFile(path) as stored:
-            features = Features(stored["pixels"], stored["scales"], stored["angles"], stored["descriptors"])
+        try:
+            with ArrayFile(path) as stored:
+                features = Features(stored["pixels"], stored["scales"], stored["angles"], stored["descriptors"])
+        except InputError:  # a power cut left it half: it is made again
+            path.unlink(missing_ok=True)
+            raise KeyError(index) from None
         self._remember(index, features)
         return features
 

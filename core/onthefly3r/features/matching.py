@@ -35,16 +35,20 @@ BAND_PX, PRIOR_BAND_PX = 1.0, 3.0
 SCALE_FACTOR, TURN_RAD = 1.5, 0.6  # from how the pair's features usually change scale and turn
 
 
-class PairMatcher:
-    """Verified matches by image pair; a pair that two subsets share is matched once.
+_Known = tuple[Camera, Camera, bool]  # cameras of a pair when it was matched, and whether both were calibrated
 
+
+class PairMatcher:
+    """Verified matches by image pair; a pair that two subsets share is matched once, and anew with better cameras.
+
+    So its matches tell of nothing but features and cameras, whichever subsets came before.
     A thorough one compares all features of every pair with all, and keeps twice as many matches.
     """
 
     def __init__(self, threads: int, thorough: bool = False) -> None:
         self._threads = threads
         self._thorough = thorough
-        self._recent: OrderedDict[tuple[int, int], Int] = OrderedDict()
+        self._recent: OrderedDict[tuple[int, int], tuple[_Known, Int]] = OrderedDict()
 
     def match(
         self,
@@ -60,21 +64,24 @@ class PairMatcher:
         between pairs; what it raises ends the work.
         """
         pairs = [(min(p), max(p)) for p in itertools.combinations(members, 2)]
-        missing = [pair for pair in pairs if pair not in self._recent]
+        known: dict[tuple[int, int], _Known] = {
+            (i, j): (cameras[i], cameras[j], calibrated[i] and calibrated[j]) for i, j in pairs
+        }
+        missing = [pair for pair in pairs if pair not in self._recent or self._recent[pair][0] != known[pair]]
         sides = {i: Side(features[i], cameras[i]) for i in sorted({i for pair in missing for i in pair})}
         with ThreadPoolExecutor(self._threads) as pool:
             found = pool.map(
                 lambda pair: verified_matches(
                     sides[pair[0]],
                     sides[pair[1]],
-                    BAND_PX if calibrated[pair[0]] and calibrated[pair[1]] else PRIOR_BAND_PX,
+                    BAND_PX if known[pair][2] else PRIOR_BAND_PX,
                     self._thorough,
                 ),
                 missing,
             )
             try:
                 for pair, verified in zip(missing, found, strict=True):
-                    self._recent[pair] = verified
+                    self._recent[pair] = known[pair], verified
                     checkpoint()
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)  # else the end of `with` waits for all pairs
@@ -82,7 +89,7 @@ class PairMatcher:
         matches = {}
         for pair in pairs:
             self._recent.move_to_end(pair)
-            matches[pair] = self._recent[pair]
+            matches[pair] = self._recent[pair][1]
         while len(self._recent) > max(CACHED_PAIRS, len(pairs)):
             self._recent.popitem(last=False)
         return matches

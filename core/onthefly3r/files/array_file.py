@@ -41,6 +41,10 @@ class ArrayFile:
         """Return whether there is an array of this name."""
         return f"{name}.npy" in self._zip.NameToInfo
 
+    def names(self) -> list[str]:
+        """Return the names of all arrays."""
+        return [name.removesuffix(".npy") for name in self._zip.NameToInfo if name.endswith(".npy")]
+
     def __getitem__(self, name: str) -> np.ndarray[Any, Any]:
         """Return one array."""
         try:

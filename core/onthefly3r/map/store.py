@@ -46,6 +46,11 @@ class Store:
         self._submaps: list[int] = []
         self._recent: OrderedDict[int, CompactReference] = OrderedDict()
 
+    @property
+    def has_journal(self) -> bool:
+        """Whether anything was written."""
+        return self._journal.exists()
+
     def commit(self, submap: Submap, frames: Sequence[NewFrame], observations: Observations | None = None) -> None:
         """Write one batch: the chunk first, then the journal line that makes it count."""
         arrays: dict[str, Any] = {}
@@ -81,25 +86,54 @@ class Store:
             journal.flush()
             os.fsync(journal.fileno())
 
+    def end_step(self, value: Any) -> None:
+        """Append the line that ends a step of the engine: a run that was stopped goes on from the last one."""
+        self.note("step", value)
+
+    def rewind(self) -> list[Any]:
+        """Cut the journal after its last step, so that the run can go on from there; return the values of all steps.
+
+        What follows the last step was begun and is done again; without any step, nothing is cut. Raises `InputError`
+        for a journal that is damaged before its end.
+        """
+        steps, end = [], 0
+        for kind, value, after in self._lines():
+            if kind == "step":
+                steps.append(value)
+                end = after
+        if steps:
+            with self._journal.open("r+b") as journal:
+                journal.truncate(end)
+                journal.flush()
+                os.fsync(journal.fileno())
+        return steps
+
     def replay(self) -> Iterator[tuple[str, Any]]:
         """Yield the journal's lines as (kind, JSON value), oldest first; raises `InputError` for a damaged one.
 
         A last line without its end was being written when the run was killed: it never counted.
         """
+        for kind, value, _ in self._lines():
+            if kind == "submap":
+                self._submaps.append(int(value.get("number", 0)))  # a damaged one is told by who reads it
+                self._chunk_of.update({int(f["index"]): int(value["number"]) for f in value["frames"]})
+            yield kind, value
+
+    def _lines(self) -> Iterator[tuple[str, Any, int]]:
+        """Yield kind, value and where it ends, in bytes, of each line of the journal."""
         if not self._journal.exists():
             raise InputError(f"{self._journal} is missing: this folder holds no map; name the output folder of a run")
-        with self._journal.open(encoding="utf-8") as journal:
+        end = 0
+        with self._journal.open("rb") as journal:
             for number, line in enumerate(journal, start=1):
-                if not line.endswith("\n"):
+                if not line.endswith(b"\n"):
                     return
                 try:
                     ((kind, value),) = json.loads(line).items()
                 except (ValueError, AttributeError) as error:
                     raise InputError(f"{self._journal}, line {number}: damaged ({error}); run again") from error
-                if kind == "submap":
-                    self._submaps.append(int(value.get("number", 0)))  # a damaged one is told by who reads it
-                    self._chunk_of.update({int(f["index"]): int(value["number"]) for f in value["frames"]})
-                yield kind, value
+                end += len(line)
+                yield kind, value, end
 
     def reference(self, index: int) -> CompactReference:
         """Return H_i of an accepted frame (Eq. 2), points in the frame of its submap."""

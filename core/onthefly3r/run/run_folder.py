@@ -23,10 +23,10 @@ PRODUCT_FILES = tuple(name for product in PRODUCTS for name in product.files)
 MAX_REPORT_BYTES = 64 * 2**20
 
 _PART = r"\.onthefly3r-[0-9a-f]{16}\.part"
-_ARRAYS = rf"(chunks|features)/(\d{{6}}(\.part)?|{_PART})\.npz"
+_ARRAYS = rf"(chunks|features|features/more)/(\d{{6}}(\.part|\.seen)?|learnt|{_PART})\.npz|features/\d{{6}}\.rgb"
 _MAP_FILE = re.compile(rf"journal\.jsonl|run\.json|{re.escape(CRASH_NOTE)}|{_PART}\.(json|txt)|{_ARRAYS}")
-FOLDERS = ("chunks", "features")  # below `work`
-_MAP_NAMES = ("journal.jsonl", "run.json", *FOLDERS)
+FOLDERS = ("chunks", "features/more", "features")  # below `work`
+_MAP_NAMES = ("journal.jsonl", "run.json", "chunks", "features")
 
 
 class RunFolder(OwnedFolder):
@@ -66,8 +66,20 @@ class RunFolder(OwnedFolder):
         """The folder in whose `work` the map of this run is."""
         return self.path if self.attempt is None else self.path / self.attempt
 
+    def unfinished(self) -> Path | None:
+        """Return the work folder of a run that did not end and goes on from there, None where there is none."""
+        attempts = [name for name in self.stamp.scratch if self._is_kept(name)]
+        homes: list[str | None] = [*attempts, *([None] if self.stamp.map_open else [])]
+        for attempt in homes:
+            work = (self.path if attempt is None else self.path / attempt) / WORK
+            if (work / "run.json").is_file():
+                self.attempt = attempt
+                return work
+        return None
+
     def plan_map(self) -> Path:
         """Decide where the map of a new run grows, and return that work folder; nothing is written."""
+        self.attempt = None
         if any(item.group == MAP for item in self.stamp.files.values()):
             self.attempt = f"{WORK}/attempt-{secrets.token_hex(8)}"
         return self.home / WORK

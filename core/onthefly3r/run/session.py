@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 from ..backbones.registry import create_backbone
 from ..engine.loop import Engine
@@ -16,12 +17,13 @@ from ..features.extraction import FeatureStore
 from ..files.room import MIB, is_storage_trouble, require_room, storage_error
 from ..intake.images import load_working_image
 from ..intake.reading import read_flight
-from ..options import Options
+from ..options import Options, over_earlier
 from ..protocol import Progress, ProgressCallback
 from ..records import RefusedPhotograph, Shot
 from ..selection.describer import create_describer
 from ..stopwatch import Stopwatch
 from .export import require_fitting
+from .going_on import require_same_map, same_photographs
 from .record import RunRecord
 from .result import Mapped, Result, write_failure, write_result
 from .run_folder import PRODUCT_FILES, RunFolder
@@ -38,20 +40,37 @@ def reconstruct(
     options: Options | None = None,
     progress: ProgressCallback | None = None,
     cancel: Callable[[], bool] | None = None,
+    anew: bool = False,
 ) -> Result:
     """Reconstruct a folder of photographs into `out`; same names and defaults as the command line.
 
-    An earlier result in `out` is replaced when the new one is complete, and stays as it was when that fails.
+    An earlier result in `out` is replaced when the new one is complete, and stays as it was when that fails. A run in
+    `out` that did not end goes on, unless it is to begin `anew`.
 
     Raises:
-        InputError: the folder, an option or the environment is wrong, or `out` holds what is not ours; nothing was
-            changed.
+        InputError: the folder, an option or the environment is wrong, `out` holds what is not ours, or a run that did
+            not end of other photographs or options; nothing was changed.
         ReconstructionError: nothing could be reconstructed or georeferenced; a report is written.
         StorageError: no room or no access.
         Cancelled: `cancel` returned true.
     """
-    with Session.open(out, options, progress, cancel) as session:
+    with Session.open(out, options, progress, cancel, anew) as session:
         session.feed_folder(Path(photos))
+        return session.finish()
+
+
+def resume(
+    out: Path,
+    named: Mapping[str, Any] | None = None,
+    progress: ProgressCallback | None = None,
+    cancel: Callable[[], bool] | None = None,
+) -> Result:
+    """Go on with a run in `out` that did not end, with its own options but for the `named` ones.
+
+    Raises as `reconstruct` does; `InputError` too when there is no such run, or its photographs are gone.
+    """
+    with Session.open(out, None, progress, cancel) as session:
+        session.take_up(named or {})
         return session.finish()
 
 
@@ -64,6 +83,7 @@ class Session:
         options: Options,
         progress: ProgressCallback | None = None,
         cancel: Callable[[], bool] | None = None,
+        anew: bool = False,
     ) -> None:
         self.folder = folder
         self.options = options
@@ -77,6 +97,7 @@ class Session:
         self._recorded_s = 0.0
         self._mapped = False
         self._facts: dict[str, object] = {}
+        self._anew = anew
 
     @classmethod
     @contextlib.contextmanager
@@ -86,14 +107,17 @@ class Session:
         options: Options | None = None,
         progress: ProgressCallback | None = None,
         cancel: Callable[[], bool] | None = None,
+        anew: bool = False,
     ) -> Iterator[Session]:
-        """Claim `out` for a run and yield its session; what a block that fails leaves can be exported.
+        """Claim `out` for a run and yield its session; what a block that fails leaves can be gone on with and exported.
+
+        A run that did not end is gone on with by the first `feed`, unless it is to begin `anew`.
 
         Raises as `RunFolder.claim` does.
         """
         options = options or Options()
         with RunFolder.claim(Path(out), "run", names=PRODUCT_FILES) as folder:
-            session = cls(folder, options, progress, cancel)
+            session = cls(folder, options, progress, cancel, anew)
             try:
                 yield session
             except BaseException as error:
@@ -111,8 +135,27 @@ class Session:
         """Read the photographs of a folder and take them all; raises `InputError` when it holds none."""
         with self._stopwatch.stage("intake"):
             flight = read_flight(photos, self.options, leave_out=self.folder.path)
-        self.photos = str(photos)
+        self.photos = str(photos.absolute())
         self.feed(flight.shots, flight.refused, flight.warnings)
+
+    def take_up(self, named: Mapping[str, Any]) -> None:
+        """Go on with the run in the folder with its own photographs and options, but for the `named` ones.
+
+        Raises `InputError` when there is no such run, its photographs are gone, or an option would change its map.
+        """
+        earlier = self._earlier()
+        if earlier is None:
+            done = "the run in it is finished" if self.folder.stamp.has_map else "it holds no run"
+            raise InputError(f"{self.folder.path}: there is nothing to go on with ({done})")
+        self.options = Options.from_flat(over_earlier(earlier.options, named))
+        shots = [earlier.shots[index] for index in sorted(earlier.shots)]
+        if shots and not any(shot.path.is_file() for shot in shots):
+            raise InputError(
+                f"{earlier.photos}: the photographs of the run in {self.folder.path} are not there; connect their "
+                f"drive, or name where they are now: 'onthefly3r run PHOTOS {self.folder.path}'"
+            )
+        self.photos = earlier.photos
+        self._take(shots, earlier.refused, earlier.warnings, earlier)
 
     def feed(
         self, shots: Sequence[Shot], refused: Sequence[RefusedPhotograph] = (), warnings: Sequence[str] = ()
@@ -121,15 +164,50 @@ class Session:
 
         Raises `InputError` when CRS, positions or boundary do not go with them, `StorageError` without room for them.
         """
+        earlier = self._earlier() if self._engine is None and not self._anew else None
+        if earlier is not None:
+            shots = same_photographs(earlier, shots, self.folder.path)
+        self._take(shots, refused, warnings, earlier)
+
+    def _take(
+        self,
+        shots: Sequence[Shot],
+        refused: Sequence[RefusedPhotograph],
+        warnings: Sequence[str],
+        earlier: RunRecord | None,
+    ) -> None:
+        """Take shots, those of the `earlier` run that is gone on with among them."""
+        if earlier is not None:
+            require_same_map(earlier, self.options, self.folder.path)
         known = list(self._engine.shots.values()) if self._engine else []
         require_fitting([*known, *shots], self.options)
         require_room(self.folder.path, room_bytes(len(shots), self.options), f"a run of {len(shots)} photographs")
-        engine = self._engine or self._begin()
-        self.refused += refused
-        engine.warnings += warnings
+        engine = self._engine
+        if engine is None:
+            engine = self._begin(goes_on=earlier is not None)
+            shots = self._take_up(engine, shots) if earlier is not None else shots
+        self.refused += [item for item in refused if item not in self.refused]
+        engine.warnings += [text for text in warnings if text not in engine.warnings]
         self._record(to_come=shots)  # before they are read, so that the record of a run that is killed then is whole
+        if not shots:
+            return
         with single_threaded_blas():
             engine.add_all(shots)
+
+    def _earlier(self) -> RunRecord | None:
+        """Return the record of the run in the folder that did not end, None without one."""
+        work = self.folder.unfinished()
+        return None if work is None else RunRecord.read(work)
+
+    def _take_up(self, engine: Engine, shots: Sequence[Shot]) -> Sequence[Shot]:
+        try:
+            return engine.take_up(shots)
+        except InputError as error:
+            self._engine = None  # leave everything as it is
+            raise InputError(
+                f"{self.folder.path}: its run cannot be gone on with: {error}; 'onthefly3r export "
+                f"{self.folder.home} NEW-FOLDER' writes what it holds, 'onthefly3r run --anew' begins again"
+            ) from error
 
     def step(self) -> None:
         """Place photographs as far as those at hand allow; the rest waits for more, or for `finish`."""
@@ -158,13 +236,15 @@ class Session:
             self._cancel,
         )
 
-    def _begin(self) -> Engine:
+    def _begin(self, goes_on: bool) -> Engine:
         """Make the engine and the folder that its map grows in; what lacks for a run is told before anything goes."""
-        backbone_options, work = self.options.backbone, self.folder.plan_map()
+        backbone_options = self.options.backbone
+        work = (self.folder.unfinished() if goes_on else None) or self.folder.plan_map()
         features = FeatureStore(work / "features", backbone_options.features, backbone_options.threads)
         backbone = create_backbone(backbone_options, features)
         describer = create_describer(self.options.selection, features, backbone_options.device)
-        self.folder.begin_map()
+        if not goes_on:
+            self.folder.begin_map()
         engine = Engine(
             work,
             self.options,
@@ -210,7 +290,8 @@ class Session:
         """Keep the map that a failure leaves, and say in the error how to use it; remove one that holds nothing."""
         if self._engine is None or not (self.folder.attempt or self.folder.stamp.map_open):
             return  # nothing was begun, or everything is in its place
-        if not self.placed and not self._mapped:
+        is_stop = isinstance(error, Cancelled | OSError | MemoryError) or not isinstance(error, Exception)
+        if not self.placed and not self._mapped and not is_stop:
             self.folder.abandon_map()
             return
         if not self._mapped:  # else the failure is one of the export, which has reported it
@@ -219,13 +300,14 @@ class Session:
                 if isinstance(error, Exception) and not isinstance(error, Cancelled):
                     mapped = Mapped(self._engine.state, self._engine.store, record)
                     write_failure(self.folder, mapped, self.options, self._stopwatch, error)
-        if not self.placed:
-            return
         given = len(self._engine.shots) + len(self.refused)
-        error.way_on = (  # type: ignore[attr-defined]
-            f"{self.placed} of {given} photographs are placed: 'onthefly3r export {self.folder.home} NEW-FOLDER' "
-            "writes their files"
-        )
+        ways = []
+        if is_stop:
+            ways.append(f"'onthefly3r resume {self.folder.path}' goes on")
+        if self.placed:
+            ways.append(f"'onthefly3r export {self.folder.home} NEW-FOLDER' writes their files")
+        if ways:
+            error.way_on = f"{self.placed} of {given} photographs are placed: {', '.join(ways)}"  # type: ignore[attr-defined]
 
 
 def room_bytes(photographs: int, options: Options) -> int:

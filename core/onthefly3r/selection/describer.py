@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from ..geometry.arrays import Float
 from ..options import SelectionOptions
@@ -19,6 +19,19 @@ class Describer(Protocol):
 
     def describe(self, index: int, image: WorkingImage) -> Float:
         """Return the descriptor (D,) float32 of one image."""
+        ...
+
+
+@runtime_checkable
+class Learns(Protocol):
+    """A descriptor that `fit` teaches something, which a run that goes on takes from the disk."""
+
+    def learnt(self) -> Mapping[str, Float]:
+        """Return what `fit` learnt, by name."""
+        ...
+
+    def recall(self, learnt: Mapping[str, Float]) -> None:
+        """Take what `learnt` returned, instead of `fit`; raises `KeyError` when something is missing."""
         ...
 
 

@@ -50,6 +50,14 @@ class VladDescriber:
         _, _, words = cv2.kmeans(training, WORDS, labels, criteria, 1, cv2.KMEANS_PP_CENTERS)
         self._words = np.asarray(words, np.float32)
 
+    def learnt(self) -> Mapping[str, Float]:
+        """Return the visual words."""
+        return {} if self._words is None else {"words": self._words}
+
+    def recall(self, learnt: Mapping[str, Float]) -> None:
+        """Take the visual words of an earlier process."""
+        self._words = np.asarray(learnt["words"], np.float32)
+
     def describe(self, index: int, image: WorkingImage) -> Float:
         """Return the L2-normalised descriptor (8192,) float32; zeros for an image in which it sees nothing."""
         if self._words is None:

@@ -10,6 +10,10 @@ import numpy as np
 from ..geometry.arrays import Bool, Float, Int
 from ..records import Neighbour
 
+# Descriptors are kept in multiples of 1/STEPS, cut towards zero: each product is then a multiple of 1/STEPS^2, no
+# partial sum is above 1, and all of them are exact in float32. A similarity is the same in whatever block, order or
+# thread it is computed, so that a run that goes on from its folder decides as one that was never stopped.
+STEPS = 4096
 KEPT_ROWS = 256  # similarity rows of images that wait: about 24 KB each at 6,000 images
 
 
@@ -36,11 +40,11 @@ class RetrievalIndex:
         return len(self._row_of)
 
     def add(self, index: int, descriptor: Float, position: Float | None = None) -> None:
-        """Add one L2-normalised descriptor (D,) and, where there is one, a rough position (2,) in metres."""
+        """Add one L2-normalised descriptor (D,), kept in `STEPS`, and, where there is one, a rough position (2,) in metres."""
         row = len(self._row_of)
         if row == len(self._table):
             self._grow(max(64, row + row // 2), len(descriptor))
-        self._table[row] = descriptor
+        self._table[row] = np.trunc(np.asarray(descriptor) * STEPS) / STEPS
         self._index_of[row] = index
         self._positions[row] = np.nan if position is None else position
         self._row_of[index] = row

@@ -24,12 +24,11 @@ class NearCopies:
 
     def add(self, index: int, rgb: UInt8) -> None:
         """Keep a small picture of an upright image (H, W, 3)."""
-        import cv2
+        self.keep(index, small_picture(rgb))
 
-        height, width = rgb.shape[:2]
-        scale = SIDE_PX / max(height, width)
-        size = max(8, round(width * scale)), max(8, round(height * scale))
-        self._small[index] = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).mean(axis=2).astype(np.uint8)
+    def keep(self, index: int, small: UInt8) -> None:
+        """Keep what `small_picture` made of an image."""
+        self._small[index] = small
 
     def __call__(self, first: int, second: int) -> bool:
         """Return whether two images are nearly the same picture; False where one is not known."""
@@ -50,6 +49,16 @@ class NearCopies:
         row, column = np.unravel_index(int(np.argmax(found)), found.shape)
         shift = max(abs(int(row) - wide - reach), abs(int(column) - wide - reach))
         return shift <= reach and float(found[row, column]) >= SAME_CORRELATION
+
+
+def small_picture(rgb: UInt8) -> UInt8:
+    """Return a small grey picture of an upright image (H, W, 3)."""
+    import cv2
+
+    height, width = rgb.shape[:2]
+    scale = SIDE_PX / max(height, width)
+    size = max(8, round(width * scale)), max(8, round(height * scale))
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).mean(axis=2).astype(np.uint8))
 
 
 def _centred(small: UInt8) -> Float:

@@ -38,6 +38,17 @@ class RetryQueue:
         """The images that wait here."""
         return list(self._aside)
 
+    @property
+    def memory(self) -> tuple[dict[int, int], dict[int, int], list[tuple[int, float, int]]]:
+        """Rejections and retries of images, and those that wait here in order, each with what decides on it."""
+        aside = [(index, one.threshold, one.new_neighbours) for index, one in self._aside.items()]
+        return self.attempts, self.retries, aside
+
+    @memory.setter
+    def memory(self, known: tuple[dict[int, int], dict[int, int], list[tuple[int, float, int]]]) -> None:
+        self.attempts, self.retries, aside = known
+        self._aside = {index: _Aside(threshold, new) for index, threshold, new in aside}
+
     def reopen(self) -> None:
         """Make every image worth another try: two fragments became one."""
         for aside in self._aside.values():
