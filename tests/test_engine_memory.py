@@ -62,9 +62,7 @@ def advance(work: Path, progress: Any = None, live: bool = False, **options: Any
     survey = survey_of(60, 4)
     images = {image.shot.name: image for image in oracle_images(survey, GRID_PX).values()}
     backbone = OracleBackbone(survey, None, FAULTS, 0, False, GRID_PX)
-    engine = Engine(
-        work, Options.from_flat(options), backbone, WeakEyed(survey), lambda s: images[s.name], progress
-    )
+    engine = Engine(work, Options.from_flat(options), backbone, WeakEyed(survey), lambda s: images[s.name], progress)
     left = engine.take_up(oracle_shots(survey))
     backbone.calls = engine.backbone_calls  # what it draws depends on the number of the call
     if live:

@@ -29,7 +29,7 @@ from .workbench import Workbench
 # Photographs between two steps of progress, per thread and at most: the image cache must hold them all.
 READ_AT_ONCE, MOST_READ_AT_ONCE = 8, 48
 
-# Photographs may come; all are there and are placed; all that can be are; the drift is removed; the cameras are refined.
+# Photographs may come; all are there; all that can be are placed; the drift is removed; the cameras are refined.
 Phase = Literal["arriving", "placing", "placed", "optimised", "refined"]
 
 

@@ -80,4 +80,6 @@ def _runs(numbers: list[int]) -> list[int]:
 def _unrolled(runs: list[int]) -> list[int]:
     if sum(runs[1::2]) > 10_000_000:
         raise ValueError("too many numbers")
-    return [number for first, count in zip(runs[::2], runs[1::2], strict=True) for number in range(first, first + count)]
+    return [
+        number for first, count in zip(runs[::2], runs[1::2], strict=True) for number in range(first, first + count)
+    ]

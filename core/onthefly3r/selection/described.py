@@ -29,7 +29,9 @@ class DescribedImages:
     def load(self, index: int) -> tuple[Float, UInt8] | None:
         """Return what `keep` kept of an image, None where it is not there any more."""
         found = self._read(f"{index:06d}.seen.npz")
-        return None if found is None or found.keys() != {"descriptor", "small"} else (found["descriptor"], found["small"])
+        return (
+            None if found is None or found.keys() != {"descriptor", "small"} else (found["descriptor"], found["small"])
+        )
 
     def keep_learnt(self, learnt: Mapping[str, Float]) -> None:
         """Keep what the descriptor learnt."""

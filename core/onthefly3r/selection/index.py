@@ -40,7 +40,7 @@ class RetrievalIndex:
         return len(self._row_of)
 
     def add(self, index: int, descriptor: Float, position: Float | None = None) -> None:
-        """Add one L2-normalised descriptor (D,), kept in `STEPS`, and, where there is one, a rough position (2,) in metres."""
+        """Add one L2-normalised descriptor (D,) and, where there is one, a rough position (2,) in metres."""
         row = len(self._row_of)
         if row == len(self._table):
             self._grow(max(64, row + row // 2), len(descriptor))
