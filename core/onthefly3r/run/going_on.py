@@ -59,10 +59,6 @@ def _is_same(one: Shot, other: Shot) -> bool:
 
 
 def _told(value: Any) -> str:
-    return (
-        "none"
-        if value is None
-        else {True: "on", False: "off"}.get(value, str(value))
-        if isinstance(value, bool)
-        else str(value)
-    )
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return "none" if value is None else str(value)
