@@ -19,7 +19,7 @@ from onthefly3r.graph.sightings import FRAMES, ViewNoise, shared_sightings
 from onthefly3r.map.state import MapState
 from onthefly3r.map.store import Store
 from onthefly3r.records import Frame, Sighting, Submap
-from onthefly3r.simulate.oracle import Bend
+from onthefly3r.simulate.bends import Bend
 
 CAMERA = Camera(56, 42, 38.0, 38.0, 28.0, 21.0)
 DOWN = np.diag([1.0, -1.0, -1.0])

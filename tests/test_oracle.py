@@ -9,7 +9,7 @@ from scipy.optimize import minimize_scalar
 from onthefly3r.geometry.transforms import Rigid3, Sim3, nearest_rotation, rotation_angle_deg
 from onthefly3r.geometry.umeyama import weighted_similarity
 from onthefly3r.records import LocalModel, LocalView, Subset
-from onthefly3r.simulate import Survey, oracle
+from onthefly3r.simulate import Survey, bends, oracle
 from onthefly3r.simulate.oracle import (
     Faults,
     Noise,
@@ -174,7 +174,7 @@ def test_bad_queries_spare_the_seed_unless_asked(survey: Survey) -> None:
 def test_doming_bends_cameras_and_points_alike(survey: Survey) -> None:
     bent = ask(OracleBackbone(survey, SILENT, Faults(doming_m=3.0)), Subset((), (0, 4, 8, 12, 15, 19, 23, 27)))
     middle = np.mean([true_pose(survey, i).translation for i in bent.views], axis=0)
-    bowl = oracle.Bend(middle, 3.0 * oracle.BEND_FORMS["bowl"], survey.options.altitude_m)
+    bowl = bends.Bend(middle, 3.0 * bends.BEND_FORMS["bowl"], survey.options.altitude_m)
     truth = {i: true_pose(survey, i) for i in bent.views}
     lifted = np.stack([bowl.apply(pose.translation) for pose in truth.values()])
     local = np.stack([view.local_from_cam.translation for view in bent.views.values()])
@@ -192,18 +192,18 @@ def test_doming_bends_cameras_and_points_alike(survey: Survey) -> None:
 
 
 @pytest.mark.parametrize("form", ["bowl", "saddle", "cylinder"])
-def test_a_model_is_bent_in_the_form_asked_for(survey: Survey, form: oracle.BendForm) -> None:
+def test_a_model_is_bent_in_the_form_asked_for(survey: Survey, form: bends.BendForm) -> None:
     """However much was drawn: a bend of that form explains all, one of another form does not."""
     bent = ask(OracleBackbone(survey, replace(SILENT, bend_m=3.0, bend_form=form)), Subset((), tuple(range(0, 28, 3))))
     truth = np.stack([true_pose(survey, i).translation for i in bent.views])
     local = np.stack([view.local_from_cam.translation for view in bent.views.values()])
 
-    def misfit(sag_m: float, of_form: oracle.BendForm) -> float:
-        bend = oracle.Bend(truth.mean(axis=0), sag_m * oracle.BEND_FORMS[of_form], survey.options.altitude_m)
+    def misfit(sag_m: float, of_form: bends.BendForm) -> float:
+        bend = bends.Bend(truth.mean(axis=0), sag_m * bends.BEND_FORMS[of_form], survey.options.altitude_m)
         lifted = bend.apply(truth)
         return float(np.abs(similarity(local, lifted).apply(local) - lifted).max())
 
-    least = {f: minimize_scalar(misfit, (0.0, 1.0), args=(f,)).fun for f in oracle.BEND_FORMS}
+    least = {f: minimize_scalar(misfit, (0.0, 1.0), args=(f,)).fun for f in bends.BEND_FORMS}
     assert least[form] < 1e-5
     assert all(value > 0.01 for f, value in least.items() if f != form)
 

@@ -17,7 +17,8 @@ from onthefly3r.selection.index import RetrievalIndex
 from onthefly3r.simulate.oracle import Faults, Noise, OracleBackbone, OracleDescriber
 from paper import simulated, strategies
 from paper.__main__ import main
-from paper.chunks import chunk_windows, find_loops
+from paper.chunks import PUBLISHED, chunk_windows, find_loops, place_chunks
+from paper.interleaved import hamiltonian_order, interleaved_windows
 from paper.partition import guests, halve, retrieval_graph, shared_most
 from paper.passes import graph_passes
 from paper.pieces import Piece, cameras, piece_of, settle, tie
@@ -38,7 +39,7 @@ def test_drones_deliver_in_turn() -> None:
     assert [views.index(view) for view in in_turn(views, 2)] == [0, 3, 1, 4, 2]
 
 
-@pytest.mark.parametrize("strategy", ["on-the-fly", "paper", "divide-and-conquer", "vanilla-unlimited"])
+@pytest.mark.parametrize("strategy", ["on-the-fly", "paper", "graph-cuts", "vanilla-unlimited"])
 def test_without_faults_every_strategy_that_needs_no_order_places_all(strategy: str, tmp_path: Path) -> None:
     row = simulated.run_one(CLEAN, strategy, 0, tmp_path)
     assert row["placed"] == row["given"] == 120
@@ -55,6 +56,13 @@ def test_chunks_follow_one_drone_but_not_two_in_turn(tmp_path: Path) -> None:
     two = simulated.run_one(replace(CLEAN, faults=Faults(strays=True)), "chunks", 0, tmp_path)
     assert one["placed"] == two["placed"] == 120
     assert one["ate"] < 2.0 < 20.0 < two["ate"]
+
+
+def test_interleaved_parts_place_what_one_call_sees_as_a_whole(tmp_path: Path) -> None:
+    one = simulated.run_one(SCENARIOS["joint"], "interleaved", 0, tmp_path)
+    assert one["placed"] == 58 and one["ate"] < 0.5 and one["calls"] == 1
+    two = simulated.run_one(replace(CLEAN, images=80, drones=1), "interleaved", 0, tmp_path)
+    assert two["placed"] == 80 and two["ate"] < 2.0 and two["calls"] == 3 and two["largest"] <= 58
 
 
 def test_a_joint_inference_runs_out_of_memory(tmp_path: Path) -> None:
@@ -191,7 +199,20 @@ def test_a_loop_is_the_most_similar_pair_of_chunks_that_are_no_neighbours() -> N
     windows = chunk_windows(20, 8)
     similarity = np.zeros((20, 20))
     similarity[1, 14], similarity[2, 15], similarity[0, 10], similarity[3, 17] = 0.7, 0.9, 0.99, 0.5
-    assert find_loops(windows, np.maximum(similarity, similarity.T)) == [(2, 15)]
+    assert find_loops(windows, np.maximum(similarity, similarity.T), 0.6) == [(2, 15)]
+    assert find_loops(windows, np.maximum(similarity, similarity.T), 0.95) == []
+
+
+def test_the_published_chunks_have_sixty_images_and_loops_of_forty(tmp_path: Path) -> None:
+    assert [list(w)[:: len(w) - 1] for w in chunk_windows(100, PUBLISHED.chunk)] == [[0, 59], [30, 89], [60, 99]]
+    sizes: list[int] = []
+
+    def infer(members: object) -> None:
+        sizes.append(len(members))  # type: ignore[arg-type]
+
+    loop = on_a_line([0.01 * min(k, 179 - k) for k in range(180)])  # there and back on the same way
+    place_chunks(180, loop, infer, 0.5, PUBLISHED)
+    assert sizes[:5] == [60] * 5 and 40 in sizes[5:] and max(sizes[5:]) <= 40
 
 
 # ------------------------------------------------------------------ parts
@@ -212,6 +233,21 @@ def test_the_graph_is_cut_where_it_is_weakest() -> None:
     assert sorted(sorted(part.tolist()) for part in parts) == [list(range(20)), list(range(20, 40))]
     assert all(len(part) <= 7 for part in halve(graph, np.arange(40), 7))
     assert sorted(i for part in halve(graph, np.arange(40), 7) for i in part) == list(range(40))
+
+
+def test_a_visual_order_follows_the_line_and_interleaved_parts_span_it() -> None:
+    shuffled = np.random.default_rng(0).permutation(90)
+    order = hamiltonian_order(90, on_a_line([0.01 * place for place in shuffled]))
+    places = shuffled[order].tolist()
+    assert places in (list(range(90)), list(range(89, -1, -1)))
+    windows = interleaved_windows(list(range(90)), 30)
+    assert [part[:3] for part, _ in windows] == [[k, k + 5, k + 10] for k in range(5)]
+    assert sorted(i for part, _ in windows for i in part) == list(range(90))
+    for (part, borrowed), (following, _) in zip(windows, [*windows[1:], windows[0]], strict=True):
+        assert len(part) + len(borrowed) <= 30 and borrowed == following[: len(borrowed)] and len(borrowed) >= 10
+        assert max(part) - min(part) >= 80
+    assert interleaved_windows([2, 0, 1], 30) == [([2, 0, 1], [])]
+    assert hamiltonian_order(0, RetrievalIndex()) == []
 
 
 def test_guests_are_the_nearest_images_outside() -> None:

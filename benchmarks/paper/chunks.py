@@ -1,12 +1,14 @@
 """Overlapping chunks in order of arrival, aligned one to the next, with loop closure: the idea of VGGT-Long.
 
 K. Deng et al., "VGGT-Long: Chunk it, Loop it, Align it", ICRA 2026. Chunks overlap by half. Images of chunks that are
-no neighbours but look alike are reconstructed together once more, which ties the two chunks by a loop.
+no neighbours but look alike are reconstructed together once more, which ties the two chunks by a loop. DA3-Streaming
+does the same with another network.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -18,18 +20,28 @@ from onthefly3r.selection.index import RetrievalIndex
 
 from .pieces import Piece, cameras, piece_of, settle, tie
 
-LOOP_SIMILARITY = 0.6  # cosine from which two images are taken for the same place
-LOOP_REACH = 5  # images before and after the two that look alike
+
+@dataclass(frozen=True)
+class ChunkSettings:
+    """Sizes in images; chunks overlap by half."""
+
+    chunk: int
+    loop_half: int  # consecutive images about each of the two that look alike; a loop call holds twice as many
+    loop_similarity: float  # cosine from which two images are taken for the same place
+
+
+FITTING = ChunkSettings(chunk=58, loop_half=11, loop_similarity=0.6)  # the memory and the descriptors of our tables
+PUBLISHED = ChunkSettings(chunk=60, loop_half=20, loop_similarity=0.85)  # the last one for another descriptor
 
 Infer = Callable[[Sequence[int]], LocalModel | None]
 
 
 def place_chunks(
-    n_images: int, index: RetrievalIndex, infer: Infer, min_confidence: float, limit: int
+    n_images: int, index: RetrievalIndex, infer: Infer, min_confidence: float, settings: ChunkSettings
 ) -> dict[int, Rigid3]:
-    """Return map_from_cam of the images 0..n-1; `limit` is the most images of one inference."""
+    """Return map_from_cam of the images 0..n-1."""
     pieces: list[Piece] = []
-    windows = chunk_windows(n_images, limit)
+    windows = chunk_windows(n_images, settings.chunk)
     for window in windows:
         model = infer(window)
         if model is not None:
@@ -38,8 +50,9 @@ def place_chunks(
             pieces.append(Piece(len(pieces), {}, {}, {}))  # keeps its number: the chain is broken here
     chain = [tie(before, after) for before, after in pairwise(pieces)]
     loops = []
-    for a, b in find_loops(windows, index.similarities(range(n_images), range(n_images))):
-        nearby = {*_around(a, n_images), *_around(b, n_images)}
+    similarity = index.similarities(range(n_images), range(n_images))
+    for a, b in find_loops(windows, similarity, settings.loop_similarity):
+        nearby = {*_around(a, n_images, settings.loop_half), *_around(b, n_images, settings.loop_half)}
         model = infer(sorted(nearby))
         if model is not None:
             loop = piece_of(len(pieces), model, min_confidence)
@@ -56,14 +69,14 @@ def chunk_windows(n_images: int, size: int) -> list[range]:
     return [range(start, min(start + size, n_images)) for start in starts]
 
 
-def find_loops(windows: Sequence[range], similarity: Float) -> list[tuple[int, int]]:
+def find_loops(windows: Sequence[range], similarity: Float, least: float) -> list[tuple[int, int]]:
     """Return the most similar pair of images (a < b) of every two chunks that are no neighbours and look alike.
 
-    similarity (N, N): cosines of all images in order of arrival.
+    similarity (N, N): cosines of all images in order of arrival; pairs below `least` do not look alike.
     """
     owners = np.array([_owner(i, windows) for i in range(len(similarity))])
     best: dict[tuple[int, int], tuple[float, int, int]] = {}
-    first, second = np.nonzero(np.triu(similarity >= LOOP_SIMILARITY, k=1))
+    first, second = np.nonzero(np.triu(similarity >= least, k=1))
     for a, b in zip(first.tolist(), second.tolist(), strict=True):
         pair = (int(owners[a]), int(owners[b]))
         if abs(pair[0] - pair[1]) < 2:
@@ -79,5 +92,7 @@ def _owner(image: int, windows: Sequence[range]) -> int:
     return next(number for number, window in enumerate(windows) if image in window)
 
 
-def _around(image: int, n_images: int) -> range:
-    return range(max(0, image - LOOP_REACH), min(n_images, image + LOOP_REACH + 1))
+def _around(image: int, n_images: int, count: int) -> range:
+    """So many consecutive images, fewer at the ends, the image in their middle."""
+    start = image - count // 2
+    return range(max(0, start), min(n_images, start + count))

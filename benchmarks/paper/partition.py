@@ -1,9 +1,8 @@
-"""Parts of the retrieval graph, reconstructed apart and merged by the images they share: the idea of MERG3R.
+"""Graph cuts: compact parts of the retrieval graph, reconstructed apart and merged by the images they share.
 
-L. K. Cheng et al., "MERG3R: A Divide-and-Conquer Approach to Large-Scale Neural Visual Geometry", CVPR 2026. The
-graph of most similar images is halved until a part fits one inference; a part then borrows the images nearest to it
-from its neighbours, which ties it to them. Arrival order does not matter. There is no bundle adjustment here: it
-would need features, which not every backbone has.
+No published method: divide and conquer as one would build it for aerial surveys, as a measure for the others (MERG3R's
+partition is in `interleaved.py`). The graph of most similar images is halved until a part fits one inference; a part
+then borrows the images nearest to it from its neighbours, which ties it to them. Arrival order does not matter.
 """
 
 from __future__ import annotations
@@ -33,12 +32,21 @@ def place_parts(
     """Return map_from_cam of the images 0..n-1; `limit` is the most images of one inference."""
     graph = retrieval_graph(n_images, index)
     parts = halve(graph, np.arange(n_images), round(limit * (1.0 - GUESTS)))
+    calls = [(part.tolist(), guests(graph, part, limit - len(part))) for part in parts]
+    return merge(calls, infer, min_confidence)
+
+
+def merge(calls: Sequence[tuple[list[int], list[int]]], infer: Infer, min_confidence: float) -> dict[int, Rigid3]:
+    """Return map_from_cam of the images of all parts: each is inferred with its guests, then all are merged.
+
+    calls: for each part its own images and those that it borrows.
+    """
     pieces: list[Piece] = []
     owner: dict[int, int] = {}
-    for part in parts:
-        model = infer([*part.tolist(), *guests(graph, part, limit - len(part))])
+    for part, borrowed in calls:
+        model = infer([*part, *borrowed])
         if model is not None:
-            owner |= {int(i): len(pieces) for i in part}
+            owner |= {i: len(pieces) for i in part}
             pieces.append(piece_of(len(pieces), model, min_confidence))
     if not pieces:
         return {}

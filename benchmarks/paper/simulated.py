@@ -46,11 +46,16 @@ SCENARIOS = {
     scenario.name: scenario
     for scenario in (
         Scenario("small", 120, 6, 2, True, NOISE, FAULTS),
+        Scenario("plain", 100, 5, 1, False, NOISE, Faults()),
         Scenario("joint", 58, 5, 1, False, NOISE, replace(FAULTS, bad_view_rate=0.0)),
         Scenario("HAV-in-order", 424, 14, 1, False, NOISE, FAULTS),
         Scenario("HAV", 424, 14, 2, False, NOISE, FAULTS),
         Scenario("HAV-saddle", 424, 14, 2, False, replace(NOISE, bend_form="saddle"), FAULTS),
         Scenario("HAV-cylinder", 424, 14, 2, False, replace(NOISE, bend_form="cylinder"), FAULTS),
+        Scenario("HAV-third-order", 424, 14, 2, False, replace(NOISE, bend_m=0.0, third_order_m=0.3), FAULTS),
+        Scenario("HAV-repeated-errors", 424, 14, 2, False, replace(NOISE, repeated=1.0), FAULTS),
+        Scenario("HAV-bad-photographs", 424, 14, 2, False, NOISE, replace(FAULTS, bad_photograph_rate=0.09)),
+        Scenario("HAV-wrong-confidence", 424, 14, 2, False, replace(NOISE, confidence="inverted"), FAULTS),
         Scenario("Residence", 2582, 33, 2, True, NOISE, FAULTS),
         Scenario("Residence-plain", 2582, 33, 2, False, NOISE, FAULTS),
         Scenario("Campus", 5871, 50, 3, True, NOISE, FAULTS),

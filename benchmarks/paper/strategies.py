@@ -1,8 +1,9 @@
 """Ways to scale one frozen local reconstructor to many images, side by side.
 
 `on-the-fly` is ours and `paper` its preset; `case-1` to `case-4` switch parts of ours off. The others are written from
-the ideas of their methods: `vanilla` (one joint inference), `chunks` (as VGGT-Long) and `divide-and-conquer` (as
-MERG3R, without its bundle adjustment).
+the ideas of their methods: `vanilla` (one joint inference), `chunks` (as VGGT-Long, with sizes and loops that suit the
+memory and descriptors here; `chunks-published` has the published settings), `interleaved` (the partition of MERG3R,
+without its bundle adjustment) and `graph-cuts` (parts of the retrieval graph, no published method).
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from onthefly3r.records import LocalModel, Rejection, Shot, Subset, WorkingImage
 from onthefly3r.selection.describer import Describer
 from onthefly3r.selection.index import RetrievalIndex
 
-from .chunks import place_chunks
+from .chunks import FITTING, PUBLISHED, place_chunks
+from .interleaved import place_interleaved
 from .partition import place_parts
 from .passes import GraphPass, graph_passes
 
@@ -37,7 +39,7 @@ ABLATION: dict[str, dict[str, object]] = {
 }
 
 ENGINE_OPTIONS: dict[str, dict[str, object]] = {"on-the-fly": {}, "paper": {"preset": "paper"}, **ABLATION}
-OFFLINE = ("chunks", "divide-and-conquer", "vanilla", "vanilla-unlimited")
+OFFLINE = ("chunks", "chunks-published", "interleaved", "graph-cuts", "vanilla", "vanilla-unlimited")
 STRATEGIES = (*ENGINE_OPTIONS, *OFFLINE)
 
 
@@ -139,5 +141,7 @@ def _place_offline(strategy: str, task: Task, backbone: Backbone) -> dict[int, R
     index = RetrievalIndex()
     for number in range(len(images)):
         index.add(number, task.describer.describe(number, images[number]))
-    run = place_chunks if strategy == "chunks" else place_parts
-    return run(len(images), index, infer, backbone.spec.confidence_threshold, JOINT_LIMIT)
+    given = (len(images), index, infer, backbone.spec.confidence_threshold)
+    if strategy.startswith("chunks"):
+        return place_chunks(*given, PUBLISHED if strategy == "chunks-published" else FITTING)
+    return (place_interleaved if strategy == "interleaved" else place_parts)(*given, JOINT_LIMIT)

@@ -19,6 +19,7 @@ from ..geometry.arrays import Float
 from ..geometry.camera import Camera, PixelMap
 from ..geometry.transforms import Rigid3, Sim3, rotation_exp
 from ..records import LocalModel, LocalView, Rejection, Shot, Subset, WorkingImage
+from .bends import BEND_FORMS, Bend, BendForm
 from .flight import Survey, SurveyOptions, TrueView, plan_survey
 from .landscape import BLOCK_SIZE_M
 
@@ -27,12 +28,7 @@ STATED_ALTITUDE_M = 100.0
 CACHED_DEPTH_MAPS = 600  # about 150 KB each
 TOKEN_LENGTH = 64
 CAMERA_KEY = "simulated"
-BendForm = Literal["bowl", "saddle", "cylinder"]
-BEND_FORMS: dict[BendForm, Float] = {
-    "bowl": np.diag([1.0, 1.0]),
-    "saddle": np.diag([1.0, -1.0]),
-    "cylinder": np.diag([1.0, 0.0]),
-}
+REPEATED, BAD_PHOTOGRAPHS = 13, 17  # streams of random numbers beside the one of each call
 COVISIBLE_WIDTHS = 0.6  # views whose footprints are less than so many widths apart see enough of the same ground
 
 
@@ -46,6 +42,9 @@ class Noise:
     log_scale: float = 0.10
     bend_m: float = 0.0  # sag at one flying height from the middle, up or down; grows with the square of the extent
     bend_form: BendForm = "bowl"
+    third_order_m: float = 0.0  # rise at one flying height in a direction drawn anew; grows with the cube of the extent
+    repeated: float = 0.0  # share of the variance of a view's camera and depth error that is the same in every call
+    confidence: Literal["honest", "flat", "inverted"] = "honest"  # flat tells nothing; inverted praises what is worst
 
 
 @dataclass(frozen=True)
@@ -58,6 +57,7 @@ class Faults:
     bad_query_rate: float = 0.0
     in_seed: bool = False  # subsets without references are affected too
     bad_view_rate: float = 0.0  # chance of every view of every subset to be bad, whatever its role
+    bad_photograph_rate: float = 0.0  # share of the survey's photographs that are bad in every subset
     strays: bool = False  # views that share no ground with the main group are put into its middle, or block on block
     doming_m: float = 0.0  # sag of every local model at one flying height from its middle
     rotation_deg: float = 30.0
@@ -88,6 +88,8 @@ class OracleBackbone:
         self._grid = grid_camera(survey.views[0].camera, grid_side_px)
         self._unit_m = survey.options.altitude_m / STATED_ALTITUDE_M
         self._depths: OrderedDict[int, Float] = OrderedDict()
+        shuffled = np.random.default_rng((seed, BAD_PHOTOGRAPHS)).permutation(len(survey.views))
+        self.bad_photographs = frozenset(shuffled[: round(self._faults.bad_photograph_rate * len(shuffled))].tolist())
 
     def reconstruct(
         self, subset: Subset, images: Mapping[int, WorkingImage], calibrations: Mapping[str, Camera]
@@ -100,7 +102,10 @@ class OracleBackbone:
         centres = np.stack([self._survey.views[i].enu_from_cam.translation for i in subset.members])
         drawn_m = self._noise.bend_m * rng.standard_normal() if self._noise.bend_m else 0.0
         sags_m = self._faults.doming_m * BEND_FORMS["bowl"] + drawn_m * BEND_FORMS[self._noise.bend_form]
-        bend = Bend(centres.mean(axis=0), sags_m * self._unit_m, self._survey.options.altitude_m)
+        cubic_m = self._noise.third_order_m * rng.standard_normal(2) if self._noise.third_order_m else np.zeros(2)
+        bend = Bend(
+            centres.mean(axis=0), sags_m * self._unit_m, self._survey.options.altitude_m, cubic_m * self._unit_m
+        )
         scale = np.exp(self._noise.log_scale * rng.standard_normal()) / self._survey.options.altitude_m
         local_from_enu = Sim3(float(scale), rotation_exp(_random_rotation(rng)), rng.normal(0.0, 3.0, 3))
         context = _unit(rng.standard_normal(TOKEN_LENGTH))
@@ -125,7 +130,7 @@ class OracleBackbone:
     def _draw_bad_views(self, subset: Subset, rng: np.random.Generator) -> set[int]:
         faults = self._faults
         hit_references, hit_queries = rng.random(2) < (faults.bad_reference_rate, faults.bad_query_rate)
-        bad: set[int] = set()
+        bad = set(self.bad_photographs.intersection(subset.members))
         if hit_references:
             count = min(faults.bad_references, len(subset.references))
             bad.update(int(i) for i in rng.permutation(subset.references)[:count])
@@ -172,20 +177,20 @@ class OracleBackbone:
         rays = grid.rays(grid.pixel_centres())
         bent_from_cam = bend.apply_to_pose(view.enu_from_cam)
         depth = self.true_depth(index).astype(float)
-        if bend.sags_m.any():
+        if not bend.is_flat:
             bent_points = bend.apply(view.enu_from_cam.apply(depth[..., None] * rays))
             depth = bent_from_cam.inverse().apply(bent_points)[..., 2]
-        pixel_error = rng.standard_normal(depth.shape)
-        depth = depth * (1.0 + self._noise.depth * pixel_error) * (1.0 + self._noise.depth * rng.standard_normal())
         rotation_deg, position_m = self._noise.rotation_deg, self._noise.position_m * self._unit_m
-        turn = np.radians(rotation_deg / np.sqrt(3.0)) * rng.standard_normal(3)
-        shift = position_m / np.sqrt(3.0) * rng.standard_normal(3)
+        error = self._errors(index, depth.shape, rng)
+        depth = depth * (1.0 + self._noise.depth * error.pixels) * (1.0 + self._noise.depth * error.depth)
+        turn = np.radians(rotation_deg / np.sqrt(3.0)) * error.turn
+        shift = position_m / np.sqrt(3.0) * error.shift
         if is_bad:
             turn = turn + np.radians(self._faults.rotation_deg) * _unit(rng.standard_normal(3))
             shift = shift + self._faults.position_m * self._unit_m * _unit(rng.standard_normal(3))
         noisy_from_cam = Rigid3(bent_from_cam.rotation @ rotation_exp(turn), bent_from_cam.translation + shift)
         points = local_from_enu.apply(noisy_from_cam.apply(depth[..., None] * rays)).astype(np.float32)
-        confidence = 0.95 * np.exp(-0.25 * pixel_error**2) + 0.03 * rng.standard_normal(depth.shape)
+        confidence = self._confidence(error.pixels, is_bad) + 0.03 * rng.standard_normal(depth.shape)
         confidence = np.where(np.isfinite(depth), np.clip(confidence, 0.0, 1.0), 0.0).astype(np.float32)
         return LocalView(
             camera=grid,
@@ -196,6 +201,30 @@ class OracleBackbone:
             tokens=self._token(context, is_bad, rng) if self.spec.has_tokens else None,
         )
 
+    def _errors(self, index: int, shape: tuple[int, ...], rng: np.random.Generator) -> UnitErrors:
+        """Return the errors of a view, partly those that it has in every call."""
+        drawn = UnitErrors.draw(shape, rng)
+        share = self._noise.repeated
+        if not share:
+            return drawn
+        own = UnitErrors.draw(shape, np.random.default_rng((self._seed, REPEATED, index)))
+        fresh, kept = np.sqrt(1.0 - share), np.sqrt(share)
+        return UnitErrors(
+            fresh * drawn.pixels + kept * own.pixels,
+            float(fresh * drawn.depth + kept * own.depth),
+            fresh * drawn.turn + kept * own.turn,
+            fresh * drawn.shift + kept * own.shift,
+        )
+
+    def _confidence(self, pixel_error: Float, is_bad: bool) -> Float:
+        """Return confidences (H, W) that follow the error, that tell nothing, or that praise what is worst."""
+        honest = 0.95 * np.exp(-0.25 * pixel_error**2)
+        if self._noise.confidence == "flat":
+            return np.full(pixel_error.shape, 0.8)
+        if self._noise.confidence == "inverted":
+            return np.full(pixel_error.shape, 0.95) if is_bad else 0.9 - 0.3 * honest
+        return np.asarray(honest)
+
     @staticmethod
     def _token(context: Float, is_bad: bool, rng: np.random.Generator) -> Float:
         """Views of one place share a direction; a bad view's token is turned away from it (cosine about 0.6)."""
@@ -204,27 +233,18 @@ class OracleBackbone:
 
 
 @dataclass(frozen=True, eq=False)
-class Bend:
-    """A bend of space: the ground rises by r' S r / radius^2 at an offset r, plumb lines stay normal to it."""
+class UnitErrors:
+    """Errors of one view in standard deviations."""
 
-    middle: Float  # (3,) ENU m; its height does not matter
-    sags_m: Float  # (2, 2) S, about east and north; a bowl has the same sag in all directions
-    radius_m: float
+    pixels: Float  # (H, W) of the depths
+    depth: float  # of all depths alike
+    turn: Float  # (3,)
+    shift: Float  # (3,)
 
-    def apply(self, points: Float) -> Float:
-        """Bend points (..., 3) in ENU."""
-        offset = (points - self.middle)[..., :2]
-        rise = 0.5 * np.sum(offset * self._slope(points), axis=-1, keepdims=True)
-        return np.asarray(points + np.concatenate([-points[..., 2:] * self._slope(points), rise], axis=-1))
-
-    def apply_to_pose(self, enu_from_cam: Rigid3) -> Rigid3:
-        """Bend a camera: it moves with the place where it is and turns with the slope there."""
-        slope = self._slope(enu_from_cam.translation)
-        turn = rotation_exp(np.array([slope[1], -slope[0], 0.0]))
-        return Rigid3(turn @ enu_from_cam.rotation, self.apply(enu_from_cam.translation))
-
-    def _slope(self, points: Float) -> Float:
-        return np.asarray(2.0 / self.radius_m**2 * (points - self.middle)[..., :2] @ self.sags_m)
+    @classmethod
+    def draw(cls, shape: tuple[int, ...], rng: np.random.Generator) -> UnitErrors:
+        """Draw them all anew."""
+        return cls(rng.standard_normal(shape), rng.standard_normal(), rng.standard_normal(3), rng.standard_normal(3))
 
 
 class OracleDescriber:
