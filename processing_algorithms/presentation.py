@@ -90,10 +90,13 @@ def switch_off(project: QgsProject, layer_id: str, tries: int = TRIES) -> None:
 
 
 def _place(layer: QgsMapLayer, group: Any) -> int:
-    """Return how many nodes of the group stay above the layer."""
-    height = _height(layer)
-    others = [node.layer() for node in group.children() if hasattr(node, "layer")]
-    return sum(other is None or (other.id() != layer.id() and _height(other) >= height) for other in others)
+    """Return where in a group a layer comes: behind the last one that lies above it."""
+    place = 0
+    for number, node in enumerate(group.children()):
+        other = node.layer() if hasattr(node, "layer") else None
+        if other is not None and other.id() != layer.id() and _height(other) >= _height(layer):
+            place = number + 1
+    return place
 
 
 def _height(layer: QgsMapLayer) -> int:

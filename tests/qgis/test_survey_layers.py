@@ -186,3 +186,22 @@ def test_results_are_not_loaded_where_that_is_not_wanted(
     )
     assert Path(told["OUTPUT"]) == made[0] == survey / f"{survey.name} reconstructed"
     assert not project.mapLayers() and "CAMERAS" not in told
+
+
+@pytest.mark.parametrize("beside", ["top of the group", "end of the group", "top of the project"])
+def test_order_holds_wherever_the_desktop_puts_new_layers(qgis: Any, plugin: Any, project: Any, beside: str) -> None:
+    from qgis.core import QgsProcessingContext, QgsProcessingFeedback, QgsVectorLayer
+
+    presentation, heights = plugin("processing_algorithms.presentation"), plugin("processing_algorithms.survey").HEIGHTS
+    root, context = project.layerTreeRoot(), QgsProcessingContext()
+    context.setProject(project)
+    for name in ("cameras", "dsm", "footprints", "rejected", "dtm", "orthophoto", "control", "cloud"):
+        layer = QgsVectorLayer("Point?crs=EPSG:32633", name, "memory")
+        project.addMapLayer(layer, False)
+        group = root.findGroup("quarry") if beside.endswith("group") else None
+        (group or root).insertLayer(-1 if beside.startswith("end") else 0, layer)
+        processor = presentation.Presentation("quarry", "", heights[name], name != "dtm")
+        processor.postProcessLayer(layer, context, QgsProcessingFeedback())
+    found = [node.name() for node in nodes(project)]
+    assert found == ["rejected", "cameras", "control", "footprints", "orthophoto", "cloud", "dsm", "dtm"]
+    assert [node.name() for node in nodes(project) if not node.itemVisibilityChecked()] == ["dtm"]
