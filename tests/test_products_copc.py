@@ -95,6 +95,16 @@ def test_coarse_levels_are_an_even_sample_and_windows_give_their_points(tmp_path
         assert abs(len(window) - expected) <= 160  # points on the rim, by the millimetre of the file
 
 
+def test_points_tell_the_part_of_a_map_in_parts(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform(0.0, 50.0, (2_000, 3))
+    extent, part_of = Extent(points.min(axis=0), points.max(axis=0)), np.array([1, 1, 2, 2, 1, 3, 3])
+    path = tmp_path / "cloud.copc.laz"
+    with CopcWriter(path, tmp_path / "work", extent, 0.1, WKT, 0.001, n_images=7, part_of=part_of) as writer:
+        writer.add(tile_of(points))
+    read = laspy.read(path)
+    assert np.array_equal(read["part"], part_of[np.asarray(read.point_source_id).astype(int) - 1])
+
+
 def test_every_point_lies_in_its_node(tmp_path: Path) -> None:
     points = grid_points(300)
     tree = Octree.of(Extent(points.min(axis=0), points.max(axis=0)), 0.05)

@@ -133,6 +133,15 @@ def test_more_images_than_16_bit_go_to_an_extra_dimension(tmp_path: Path) -> Non
     assert (read.point_source_id == 0).all()
 
 
+def test_points_tell_the_part_of_a_map_in_parts(tmp_path: Path) -> None:
+    part_of = np.arange(400) % 3 + 1
+    write_cloud(tmp_path / "cloud.laz", tiles(), WKT1, 0.001, part_of=part_of)
+    read = laspy.read(tmp_path / "cloud.laz")
+    assert np.array_equal(read["part"], part_of[np.concatenate([t.source for t in tiles()])])
+    write_cloud(tmp_path / "whole.laz", tiles(), WKT1, 0.001)
+    assert "part" not in laspy.read(tmp_path / "whole.laz").point_format.dimension_names
+
+
 def test_an_empty_cloud_is_refused_and_leaves_what_was_there(tmp_path: Path) -> None:
     (tmp_path / "cloud.laz").write_bytes(b"old")
     with pytest.raises(ReconstructionError, match="no points"):

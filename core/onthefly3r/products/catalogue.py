@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
+from ..geometry.arrays import Int
 from ..options import ExportOptions
 from .cloudpass import Cloud, Sink
 from .copc import CopcWriter
@@ -85,10 +88,20 @@ def _shapefile(name: str) -> tuple[str, ...]:
 def _cloud(out: Path, view: RunView, cloud: Cloud) -> Sink:
     scale_m, wkt, images = las_scale_m(cloud.spacing_m), view.frame.wkt, len(view.shots)
     if view.options.export.format == "copc":
+        path = out / "cloud.copc.laz"
         return CopcWriter(
-            out / "cloud.copc.laz", view.work, cloud.extent, cloud.spacing_m, wkt, scale_m, view.title, images
+            path, view.work, cloud.extent, cloud.spacing_m, wkt, scale_m, view.title, images, _parts(view)
         )
-    return CloudWriter(out / f"cloud.{view.options.export.format}", wkt, scale_m, view.title, images)
+    return CloudWriter(out / f"cloud.{view.options.export.format}", wkt, scale_m, view.title, images, _parts(view))
+
+
+def _parts(view: RunView) -> Int | None:
+    """Return the part of the map that each photograph lies in, None where the map is one."""
+    if all(camera.part == 1 for camera in view.cameras):
+        return None
+    table = np.zeros(1 + max(camera.index for camera in view.cameras), np.int64)
+    table[[camera.index for camera in view.cameras]] = [camera.part for camera in view.cameras]
+    return table
 
 
 def _surface(out: Path, view: RunView, cloud: Cloud) -> Sink:

@@ -98,12 +98,14 @@ class CopcWriter:
         scale_m: float,
         description: str = "",
         n_images: int = 0,
+        part_of: Int | None = None,
     ) -> None:
         """`extent` must hold all points; the other arguments are those of `las.write_cloud`."""
         self._path, self._work, self._octree = path, work / "copc", Octree.of(extent, spacing_m)
-        self._wide = n_images > MAX_POINT_SOURCE
+        self._wide, self._part_of = n_images > MAX_POINT_SOURCE, part_of
         offset = np.round((extent.low + extent.high) / 2.0)
-        self._header = las_header(offset, scale_m, wkt1 or LOCAL_WKT1, description, self._wide)
+        in_parts = part_of is not None
+        self._header = las_header(offset, scale_m, wkt1 or LOCAL_WKT1, description, self._wide, in_parts)
         self._seen: list[set[int]] = [set() for _ in range(min(self.SHARED_LEVELS, self._octree.depth))]
         self._buffer: list[tuple[Int, Any]] = []
         self._buffered = 0
@@ -119,7 +121,8 @@ class CopcWriter:
         """Take the points of a tile in the export frame."""
         if not len(tile.points):
             return
-        self._buffer.append((self._octree.nodes(tile.points, self._seen), las_record(tile, self._header, self._wide)))
+        record = las_record(tile, self._header, self._wide, self._part_of)
+        self._buffer.append((self._octree.nodes(tile.points, self._seen), record))
         self._buffered += len(tile.points)
         self._meter.add(tile.points)
         if self._buffered >= RUN_POINTS:

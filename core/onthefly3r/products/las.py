@@ -14,7 +14,7 @@ import numpy as np
 from .. import __version__
 from ..errors import ReconstructionError
 from ..files.atomic import replacing
-from ..geometry.arrays import Float
+from ..geometry.arrays import Float, Int
 from ..geometry.spacing import point_spacing
 from ..records import CloudTile
 
@@ -75,14 +75,22 @@ class CloudWriter:
 
     Red, green and blue are 16 bit (8 bit x 257). Point source id is the image number from 1 (shot index + 1); with
     more images than it can count, it is 0 and the extra dimension `image` holds the number. Further extra dimensions:
-    `confidence` 0..255, `batch`, `n_views` (also in user data, which QGIS keeps). Every point is return 1 of 1, and of
-    class 0 where the tiles are not classified.
+    `confidence` 0..255, `batch`, `n_views` (also in user data, which QGIS keeps), and `part` where the map is in parts
+    that nothing connects. Every point is return 1 of 1, and of class 0 where the tiles are not classified.
     """
 
-    def __init__(self, path: Path, wkt1: str | None, scale_m: float, description: str = "", n_images: int = 0) -> None:
+    def __init__(
+        self,
+        path: Path,
+        wkt1: str | None,
+        scale_m: float,
+        description: str = "",
+        n_images: int = 0,
+        part_of: Int | None = None,
+    ) -> None:
         """See `write_cloud` for the arguments."""
         self._path, self._wkt, self._scale_m = path, wkt1 or LOCAL_WKT1, scale_m
-        self._description, self._wide = description, n_images > MAX_POINT_SOURCE
+        self._description, self._wide, self._part_of = description, n_images > MAX_POINT_SOURCE, part_of
         self._files = ExitStack()
         self._writer: Any = None
         self._header: Any = None
@@ -98,13 +106,14 @@ class CloudWriter:
             return
         if self._writer is None:
             self._open(np.round(tile.points.mean(axis=0)))
-        self._writer.write_points(las_record(tile, self._header, self._wide))
+        self._writer.write_points(las_record(tile, self._header, self._wide, self._part_of))
         self._meter.add(tile.points)
 
     def _open(self, offset: Float) -> None:
         import laspy
 
-        self._header = las_header(offset, self._scale_m, self._wkt, self._description, self._wide)
+        in_parts = self._part_of is not None
+        self._header = las_header(offset, self._scale_m, self._wkt, self._description, self._wide, in_parts)
         temporary = self._files.enter_context(replacing(self._path))
         compress = self._path.suffix.lower() == ".laz"
         self._writer = self._files.enter_context(
@@ -138,6 +147,7 @@ def write_cloud(
     scale_m: float,
     description: str = "",
     n_images: int = 0,
+    part_of: Int | None = None,
 ) -> CloudSummary:
     """Write the tiles one after the other as `CloudWriter` does, and return what the file holds.
 
@@ -148,19 +158,20 @@ def write_cloud(
         scale_m: resolution of the stored coordinates, see `las_scale_m`.
         description: text kept in the file (LASF_Spec record 3).
         n_images: number of photographs given, decides where image numbers are kept.
+        part_of: part of the map (N,) of each shot index; None where the map is one.
 
     Raises:
         ReconstructionError: no tile has a point, or the coordinates do not fit 32 bit at this scale.
     """
-    with CloudWriter(path, wkt1, scale_m, description, n_images) as writer:
+    with CloudWriter(path, wkt1, scale_m, description, n_images, part_of) as writer:
         for tile in tiles:
             writer.add(tile)
     assert writer.summary is not None
     return writer.summary
 
 
-def las_header(offset: Float, scale_m: float, wkt1: str, description: str, wide: bool) -> Any:
-    """Return a laspy header of our clouds; `wide` keeps image numbers in an extra dimension."""
+def las_header(offset: Float, scale_m: float, wkt1: str, description: str, wide: bool, in_parts: bool) -> Any:
+    """Return a laspy header of our clouds; `wide` keeps image numbers in an extra dimension, `in_parts` parts."""
     import laspy
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
@@ -173,6 +184,8 @@ def las_header(offset: Float, scale_m: float, wkt1: str, description: str, wide:
     extra.append(("n_views", "uint8", "images that saw the point"))
     if wide:
         extra.append(("image", "uint32", "image number from 1"))
+    if in_parts:
+        extra.append(("part", "uint16", "part of the map, 1 = largest"))
     header.add_extra_dims([laspy.ExtraBytesParams(name, kind, text) for name, kind, text in extra])
     # Not header.add_crs: it writes WKT 2, which point formats 6-10 do not allow.
     header.vlrs.append(WktCoordinateSystemVlr(wkt1))
@@ -183,8 +196,8 @@ def las_header(offset: Float, scale_m: float, wkt1: str, description: str, wide:
     return header
 
 
-def las_record(tile: CloudTile, header: Any, wide: bool) -> Any:
-    """Return the points of a tile as a record of laspy."""
+def las_record(tile: CloudTile, header: Any, wide: bool, part_of: Int | None) -> Any:
+    """Return the points of a tile as a record of laspy; `part_of` as for `write_cloud`."""
     import laspy
 
     record = laspy.ScaleAwarePointRecord.zeros(len(tile.points), header=header)
@@ -204,6 +217,8 @@ def las_record(tile: CloudTile, header: Any, wide: bool) -> Any:
         record.classification = tile.classification
     record["confidence"] = np.rint(np.clip(tile.confidence, 0.0, 1.0) * 255.0).astype(np.uint8)
     record["batch"] = tile.batch.astype(np.uint32)
+    if part_of is not None:
+        record["part"] = part_of[tile.source].astype(np.uint16)
     image = tile.source.astype(np.int64) + 1
     if wide:
         record["image"] = image.astype(np.uint32)
