@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -201,9 +202,49 @@ def test_a_damaged_line_is_told_with_its_place(tmp_path: Path, line: str, said: 
     filled(tmp_path)
     journal = tmp_path / "journal.jsonl"
     lines = journal.read_text(encoding="utf-8").splitlines()
-    journal.write_text("\n".join([lines[0], line, *lines[1:]]) + "\n", encoding="utf-8")
+    checked = f"{zlib.crc32(line.encode()):08x} {line}"
+    journal.write_text("\n".join([lines[0], checked, *lines[1:]]) + "\n", encoding="utf-8")
     with pytest.raises(InputError, match=said):
         MapState.load(Store(tmp_path))
+
+
+def test_any_flipped_byte_is_told_and_what_comes_before_is_there(tmp_path: Path) -> None:
+    filled(tmp_path)
+    journal = tmp_path / "journal.jsonl"
+    whole = journal.read_bytes()
+    lines = whole.splitlines(keepends=True)
+    starts = np.cumsum([0, *map(len, lines)])
+    for place in np.random.default_rng(0).integers(0, len(whole) - 1, 40):
+        line = int(np.searchsorted(starts, place, side="right"))
+        journal.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+        with pytest.raises(InputError, match=f"line {line}: damaged.*--partial"):
+            MapState.load(Store(tmp_path))
+        store = Store(tmp_path, partial=True)
+        frames = list(MapState.load(store).frames)
+        assert frames == [4, 2, 9, 7, 1][: len(frames)] and len(store.lost) == 1
+        assert (len(frames) > 0) == (line > 3) and (len(frames) > 3) == (line > 4)
+
+
+def test_a_journal_of_the_first_format_is_read(tmp_path: Path) -> None:
+    state = filled(tmp_path)
+    journal = tmp_path / "journal.jsonl"
+    lines = journal.read_text(encoding="utf-8").splitlines()[1:]
+    journal.write_text("".join(line.split(" ", 1)[1] + "\n" for line in lines), encoding="utf-8")
+    assert_same(state, MapState.load(Store(tmp_path)))
+
+
+@pytest.mark.parametrize("missing", [True, False])
+def test_a_damaged_chunk_costs_the_points_of_its_photographs_only(tmp_path: Path, missing: bool) -> None:
+    filled(tmp_path)
+    chunk = tmp_path / "chunks" / "000000.npz"
+    held = bytearray(chunk.read_bytes())
+    held[len(held) // 2] ^= 1
+    chunk.unlink() if missing else chunk.write_bytes(held)
+    store = Store(tmp_path, partial=True)
+    assert len(MapState.load(store).frames) == 5
+    store.look_at_chunks()
+    assert len(store.lost) == 1 and "3 photographs" in store.lost[0]
+    assert [points.index for points in store.stream_points()] == [7, 1] and not len(store.reference(4).points)
 
 
 def test_a_folder_without_a_journal_is_told(tmp_path: Path) -> None:

@@ -166,6 +166,10 @@ def check(
 def export(
     result: Annotated[Path, typer.Argument(metavar="RESULT", help="output folder of an earlier run")],
     out: Out,
+    partial: Annotated[
+        bool,
+        typer.Option("--partial", help="of a run whose files are damaged, write what is not", show_default=False),
+    ] = False,
     json: JsonLines = False,
     **values: Any,
 ) -> None:
@@ -176,7 +180,7 @@ def export(
         from ..run.record import earlier_options
 
         options = run_options(over_earlier(earlier_options(result), given(values)))
-        again = export_run(result, out, options, here.progress)
+        again = export_run(result, out, options, here.progress, partial)
         for warning in again.report.get("warnings", ()):
             here.warning(warning)
         here.result(_result_data(again), columns(_result_summary(again)))

@@ -24,10 +24,17 @@ from .result import Mapped, Result, write_result
 from .run_folder import FAILURE, PRODUCT_FILES, RESULT, RunFolder, settle
 
 
-def export(run: Path, out: Path, options: Options | None = None, progress: ProgressCallback | None = None) -> Result:
+def export(
+    run: Path,
+    out: Path,
+    options: Options | None = None,
+    progress: ProgressCallback | None = None,
+    partial: bool = False,
+) -> Result:
     """Write the files of an earlier run again into `out`, with another CRS, format or spacing.
 
     A run that did not end gives what was placed by then, and the report says so. `out` may be the folder of the run.
+    With `partial`, a damaged one gives what is undamaged, and the warnings say what is lost.
 
     Raises:
         InputError: `run` holds no map, an option is wrong, or `out` holds what is not ours; nothing was changed.
@@ -36,7 +43,7 @@ def export(run: Path, out: Path, options: Options | None = None, progress: Progr
     """
     out, options = Path(out), options or Options()
     stopwatch = Stopwatch()
-    mapped = open_run(Path(run), options)
+    mapped = open_run(Path(run), options, partial)
     with RunFolder.claim(out, "export", names=PRODUCT_FILES) as folder:
         return write_result(
             folder,
@@ -60,14 +67,17 @@ def georeference(run: Path, options: Options | None = None) -> GeoReference:
     return main_reference(state, mapped.record.shots, options.georeference, ground_normal(main_part(state)))
 
 
-def open_run(run: Path, options: Options) -> Mapped:
+def open_run(run: Path, options: Options, partial: bool = False) -> Mapped:
     """Return the map in the folder of a run, with the positions that the options name; raises `InputError`."""
     if not run.is_dir():
         raise InputError(f"{run}: no such folder; name the output folder of a run")
     settle(run)
-    store = Store(run / "work")
+    store = Store(run / "work", partial)
     state = MapState.load(store)
     record = RunRecord.read(run / "work")
+    if partial:
+        store.look_at_chunks()
+        record = replace(record, warnings=[*record.warnings, *store.lost])
     unknown = next((index for index in state.frames if index not in record.shots), None)
     if unknown is not None:
         raise InputError(
