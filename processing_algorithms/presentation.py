@@ -31,7 +31,7 @@ from .base import ROOT, tr
 from .field_types import TEXT
 from .survey import has_unreadable_cloud, survey_layers, survey_title
 
-STYLES = ROOT / "resources" / "styles"
+STYLES = ROOT / "core" / "onthefly3r" / "products" / "styles"
 HEIGHT_PROPERTY = "onthefly3r/height"  # of a layer: those with the greater one lie above the others
 DEEP_COLOUR = 65535.0  # LAS tells colours in 16 bits
 TRIES, AGAIN_MS = 10, 200

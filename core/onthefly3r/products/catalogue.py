@@ -40,7 +40,7 @@ class Layer:
     title: str
     kind: Literal["vector", "raster", "point cloud"]
     height: int
-    style: str = ""  # file in resources/styles
+    style: str = ""  # file in products/styles
     shown: bool = True  # False: among the layers, but switched off
 
 
@@ -130,7 +130,14 @@ def _footprints(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
 
 
 def _geopackage(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
-    write_geopackage(out / "survey.gpkg", view.rows, view.footprints, view.crs)
+    write_geopackage(
+        out / "survey.gpkg",
+        view.rows,
+        view.footprints,
+        view.crs,
+        photographs={index + 1: shot.path for index, shot in view.shots.items()},
+        control=view.control,
+    )
 
 
 def _trajectory(out: Path, view: RunView, made: Mapping[str, Any]) -> None:

@@ -1,15 +1,18 @@
-"""`survey.gpkg`: cameras, rejected photographs and footprints in one GeoPackage (OGC 12-128r18)."""
+"""`survey.gpkg`: cameras, rejected photographs, control and coverage in one styled GeoPackage (OGC 12-128r18)."""
 
 from __future__ import annotations
 
+import math
 import sqlite3
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..files.atomic import replacing
+from ..records import ControlResidual
+from .coverage import covered, weak_areas
 from .footprints import Footprint
 from .rows import CameraRow
 from .vector import FIELDS
@@ -31,30 +34,70 @@ CREATE TABLE gpkg_geometry_columns (table_name TEXT PRIMARY KEY REFERENCES gpkg_
   column_name TEXT NOT NULL, geometry_type_name TEXT NOT NULL,
   srs_id INTEGER NOT NULL REFERENCES gpkg_spatial_ref_sys(srs_id), z TINYINT NOT NULL, m TINYINT NOT NULL);
 """
+# Where QGIS looks for the style of a layer (its own convention, see QgsOgrProvider).
+STYLES_SCHEMA = """
+CREATE TABLE layer_styles (id INTEGER PRIMARY KEY AUTOINCREMENT, f_table_catalog TEXT(256), f_table_schema TEXT(256),
+  f_table_name TEXT(256), f_geometry_column TEXT(256), styleName TEXT(30), styleQML TEXT, styleSLD TEXT,
+  useAsDefault BOOLEAN, description TEXT, owner TEXT(30), ui TEXT(30),
+  update_time DATETIME DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ','now')));
+INSERT INTO gpkg_contents (table_name, data_type, identifier) VALUES ('layer_styles', 'attributes', 'layer_styles');
+"""
+STYLES = Path(__file__).with_name("styles")
+CONTROL_FIELDS = (
+    ("label", "TEXT"),
+    ("role", "TEXT"),
+    ("images", "INTEGER"),
+    ("east_m", "REAL"),
+    ("north_m", "REAL"),
+    ("up_m", "REAL"),
+    ("sigma_h_m", "REAL"),
+    ("sigma_v_m", "REAL"),
+    ("marks_px", "REAL"),
+)
+Xyz = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class _Table:
     name: str
-    geometry: str  # POINT or POLYGON
+    geometry: str  # POINT (with a height), POLYGON or MULTIPOLYGON
     fields: tuple[tuple[str, str], ...]  # name, SQL type
-    rows: tuple[tuple[Sequence[tuple[float, ...]] | None, tuple[Any, ...]], ...]  # vertices, values
+    rows: tuple[tuple[Any, tuple[Any, ...]], ...]  # shapely geometry or None, values
 
 
 def write_geopackage(
-    path: Path, rows: Iterable[CameraRow], footprints: Iterable[Footprint], crs: str | None
+    path: Path,
+    rows: Iterable[CameraRow],
+    footprints: Iterable[Footprint],
+    crs: str | None,
+    *,
+    photographs: Mapping[int, Path] | None = None,
+    control: Sequence[tuple[ControlResidual, Xyz]] = (),
 ) -> dict[str, int]:
-    """Write the layers cameras, rejected and footprints, and return the number of features of each.
+    """Write the layers of a survey with their styles, and return the number of features of each.
 
-    Rejected photographs without a position are kept without geometry. Fields are those of the shapefiles, without their
-    limits. `crs` is anything pyproj reads; None gives the undefined Cartesian reference system.
+    Layers are cameras, rejected, footprints, coverage (all footprints as one), fly_again (what too few photographs
+    show) and, when there is any, control. Rejected photographs without a position are kept without geometry. Fields
+    are those of the shapefiles, without their limits, and the path of the photograph.
+
+    Args:
+        path: final name, ending in .gpkg.
+        rows: in capture order; coordinates in `crs`.
+        footprints: in `crs`.
+        crs: anything pyproj reads; None gives the undefined Cartesian reference system.
+        photographs: their files, by number (shot index + 1).
+        control: control points and checkpoints, each with its coordinates in `crs`; NaN for an unknown height.
     """
-    listed = list(rows)
-    tables = (
-        _cameras("cameras", [row for row in listed if row.status == "placed"]),
-        _cameras("rejected", [row for row in listed if row.status == "rejected"]),
-        _footprints(footprints),
-    )
+    listed, outlines = list(rows), list(footprints)
+    files = photographs or {}
+    tables = [
+        _cameras("cameras", [row for row in listed if row.status == "placed"], files),
+        _cameras("rejected", [row for row in listed if row.status == "rejected"], files),
+        _footprints(outlines),
+        _coverage(outlines),
+        _weak(outlines),
+        *([_control(control)] if control else []),
+    ]
     with replacing(path) as temporary:
         temporary.unlink(missing_ok=True)
         connection = sqlite3.connect(temporary)
@@ -64,6 +107,7 @@ def write_geopackage(
             reference = _references(connection, crs)
             for table in tables:
                 _write(connection, table, reference)
+            _write_styles(connection, tables)
             connection.commit()
         finally:
             connection.close()
@@ -87,22 +131,70 @@ def _references(connection: sqlite3.Connection, crs: str | None) -> int:
     return number
 
 
-def _cameras(name: str, rows: Sequence[CameraRow]) -> _Table:
+def _cameras(name: str, rows: Sequence[CameraRow], files: Mapping[int, Path]) -> _Table:
+    from shapely import Point
+
     fields = tuple((field, TYPES[kind]) for field, kind, _, _ in FIELDS)
     values = tuple(
-        (None if row.position is None else [row.position], tuple(_plain(getattr(row, field)) for field, _ in fields))
+        (
+            None if row.position is None else Point(row.position),
+            (*(_plain(getattr(row, field)) for field, _ in fields), _file(files.get(row.number))),
+        )
         for row in rows
     )
-    return _Table(name, "POINT", fields, values)
+    return _Table(name, "POINT", (*fields, ("path", "TEXT")), values)
 
 
-def _footprints(footprints: Iterable[Footprint]) -> _Table:
+def _file(path: Path | None) -> str | None:
+    return None if path is None else str(_plain(str(path.absolute())))
+
+
+def _footprints(footprints: Sequence[Footprint]) -> _Table:
+    from shapely import Polygon
+
     fields = (("image", "TEXT"), ("number", "INTEGER"), ("gsd_m", "REAL"), ("area_m2", "REAL"), ("overlap", "INTEGER"))
-    values = []
-    for item in footprints:
-        ring = [tuple(float(v) for v in corner) for corner in item.outline]
-        values.append(([*ring, ring[0]], tuple(_plain(getattr(item, field)) for field, _ in fields)))
+    values = [
+        (Polygon(item.outline), tuple(_plain(getattr(item, field)) for field, _ in fields)) for item in footprints
+    ]
     return _Table("footprints", "POLYGON", fields, tuple(values))
+
+
+def _coverage(footprints: Sequence[Footprint]) -> _Table:
+    union = covered(footprints)
+    fields = (("photographs", "INTEGER"), ("area_m2", "REAL"))
+    values = ((union, (len(footprints), float(union.area))),) if footprints else ()
+    return _Table("coverage", "MULTIPOLYGON", fields, values)
+
+
+def _weak(footprints: Sequence[Footprint]) -> _Table:
+    fields = (("photographs", "INTEGER"), ("area_m2", "REAL"), ("reason", "TEXT"))
+    values = [(weak.area, (weak.photographs, float(weak.area.area), weak.reason)) for weak in weak_areas(footprints)]
+    return _Table("fly_again", "POLYGON", fields, tuple(values))
+
+
+def _control(points: Sequence[tuple[ControlResidual, Xyz]]) -> _Table:
+    from shapely import Point
+
+    values = []
+    for point, (x, y, z) in points:
+        residuals = (getattr(point, field) for field, _ in CONTROL_FIELDS)
+        known = tuple(None if isinstance(v, float) and not math.isfinite(v) else _plain(v) for v in residuals)
+        values.append((Point(x, y, z if math.isfinite(z) else 0.0), known))
+    return _Table("control", "POINT", CONTROL_FIELDS, tuple(values))
+
+
+def _write_styles(connection: sqlite3.Connection, tables: Sequence[_Table]) -> None:
+    """Store the styles of the layers where QGIS looks for them."""
+    connection.executescript(STYLES_SCHEMA)
+    for table in tables:
+        style = STYLES / f"{table.name}.qml"
+        if style.is_file():
+            connection.execute(
+                "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, "
+                "styleName, styleQML, styleSLD, useAsDefault, description, owner) "
+                "VALUES ('', '', ?, 'geom', ?, ?, '', 1, 'On-the-Fly3R', '')",
+                (table.name, table.name, style.read_text(encoding="utf-8")),
+            )
 
 
 def _write(connection: sqlite3.Connection, table: _Table, reference: int) -> None:
@@ -114,10 +206,12 @@ def _write(connection: sqlite3.Connection, table: _Table, reference: int) -> Non
     names = ", ".join(["geom", *(f'"{name}"' for name, _ in table.fields)])
     connection.executemany(
         f'INSERT INTO "{table.name}" ({names}) VALUES ({marks})',  # noqa: S608 - names are our own
-        [(_blob(vertices, table.geometry, reference), *values) for vertices, values in table.rows],
+        [(_blob(shape, reference), *values) for shape, values in table.rows],
     )
-    points = [vertex for vertices, _ in table.rows for vertex in vertices or ()]
-    bounds = [f(p[k] for p in points) for f in (min, max) for k in (0, 1)] if points else [None] * 4
+    from shapely import total_bounds
+
+    shapes = [shape for shape, _ in table.rows if shape is not None]
+    bounds = [float(value) for value in total_bounds(shapes)] if shapes else [None] * 4
     connection.execute(
         "INSERT INTO gpkg_contents (table_name, data_type, identifier, min_x, min_y, max_x, max_y, srs_id) "
         "VALUES (?, 'features', ?, ?, ?, ?, ?, ?)",
@@ -130,15 +224,14 @@ def _write(connection: sqlite3.Connection, table: _Table, reference: int) -> Non
     )
 
 
-def _blob(vertices: Sequence[tuple[float, ...]] | None, geometry: str, reference: int) -> bytes | None:
+def _blob(shape: Any, reference: int) -> bytes | None:
     """Return GeoPackage binary: its header without an envelope, then little-endian WKB (ISO)."""
-    if vertices is None:
+    from shapely import to_wkb
+
+    if shape is None:
         return None
     header = b"GP" + struct.pack("<BBi", 0, 1, reference)
-    if geometry == "POINT":
-        return header + struct.pack("<BI3d", 1, 1001, *vertices[0])
-    ring = b"".join(struct.pack("<2d", *vertex[:2]) for vertex in vertices)
-    return header + struct.pack("<BIII", 1, 3, 1, len(vertices)) + ring
+    return header + bytes(to_wkb(shape, byte_order=1, flavor="iso"))
 
 
 def _plain(value: Any) -> Any:

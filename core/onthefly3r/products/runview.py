@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+
+import numpy as np
 
 from .. import __version__
 from ..cloud.figures import DenseFigures
@@ -13,7 +16,7 @@ from ..geometry.geodesy import VERTICAL_NAMES
 from ..map.state import MapState
 from ..map.store import Store
 from ..options import Options
-from ..records import GeoReference, PlacedCamera, RefusedPhotograph, Rejection, Shot
+from ..records import ControlResidual, GeoReference, PlacedCamera, RefusedPhotograph, Rejection, Shot
 from .cameras import camera_rows, footprints, placed_cameras
 from .exportframe import ExportFrame
 from .footprints import Footprint
@@ -75,6 +78,16 @@ class RunView:
     def footprints(self) -> list[Footprint]:
         """What the placed cameras cover on the ground."""
         return footprints(self.cameras, self.state, self.frame)
+
+    @property
+    def control(self) -> list[tuple[ControlResidual, tuple[float, float, float]]]:
+        """Control points and checkpoints, each with its coordinates in the files; NaN for an unknown height."""
+        placed = []
+        for point in self.reference.control if self.reference else ():
+            east, north, up = point.enu_m
+            x, y, z = self.frame.from_level(np.array([[east, north, up if math.isfinite(up) else 0.0]]))[0]
+            placed.append((point, (float(x), float(y), float(z) if math.isfinite(up) else math.nan)))
+        return placed
 
 
 def raster_tags(view: RunView) -> dict[str, str]:
