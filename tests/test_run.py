@@ -24,6 +24,7 @@ from onthefly3r.run.result import Result
 from onthefly3r.simulate import SurveyOptions, simulate_survey
 
 FAST = {"dense_px": 200, "threads": 2}
+LIGHT = {"quality": "preview", "rasters": False, "orthophoto": "none", "threads": 2}  # files that tests do not look at
 FILES = (
     *("cloud.laz", "trajectory.csv", "preview.png", "report.json", "report.html"),
     *(f"{name}{suffix}" for name in ("cameras", "footprints") for suffix in (".shp", ".shx", ".dbf", ".prj", ".cpg")),
@@ -124,7 +125,7 @@ def test_progress_is_told_in_order(case: Case) -> None:
 
 
 def test_export_again_in_another_crs(case: Case, tmp_path: Path) -> None:
-    again = export(case.out, tmp_path / "again", Options.from_flat({"crs": "EPSG:3035", "format": "las"}))
+    again = export(case.out, tmp_path / "again", Options.from_flat({**LIGHT, "crs": "EPSG:3035", "format": "las"}))
     assert again.report["georeference"]["crs"] == "EPSG:3035"
     assert (tmp_path / "again" / "cloud.las").exists() and not (tmp_path / "again" / "cloud.laz").exists()
     assert again.placed == 12
@@ -135,11 +136,11 @@ def test_without_positions_the_report_says_why_and_local_works(case: Case, tmp_p
     name = sorted(case.photos.glob("*.JPG"))[2].name
     (tmp_path / "geo.txt").write_text(f"EPSG:4326\n{name} 15.0 48.0 300\n", encoding="utf-8")
     with pytest.raises(GeoreferenceError, match="--local"):
-        export(case.out, tmp_path / "none", Options.from_flat({"positions": str(tmp_path / "geo.txt")}))
+        export(case.out, tmp_path / "none", Options.from_flat({**LIGHT, "positions": str(tmp_path / "geo.txt")}))
     report = json.loads((tmp_path / "none" / "report.json").read_text(encoding="utf-8"))
     assert report["georeference"] is None and "position" in report["error"]
     assert not (tmp_path / "none" / "cloud.laz").exists()
-    unknown = {"local": True, "positions": str(tmp_path / "geo.txt")}
+    unknown = {**LIGHT, "local": True, "positions": str(tmp_path / "geo.txt")}
     local = export(case.out, tmp_path / "units", Options.from_flat(unknown))
     assert local.cloud is not None and local.report["georeference"] is None
     assert any("not metres" in warning for warning in local.report["warnings"])
@@ -147,7 +148,7 @@ def test_without_positions_the_report_says_why_and_local_works(case: Case, tmp_p
 
 def test_local_coordinates_are_metres_where_positions_tell(case: Case, tmp_path: Path) -> None:
     """The scale is that of twelve positions of 1.5 m (1 sigma) over 90 m."""
-    local = export(case.out, tmp_path, Options.from_flat({"local": True}))
+    local = export(case.out, tmp_path, Options.from_flat({**LIGHT, "local": True}))
     assert local.report["georeference"] is None
     assert [told for told in local.report["warnings"] if "are not placed" not in told] == []
     report = evaluate(tmp_path, case.truth, align="se3")
@@ -185,16 +186,16 @@ def test_what_fails_or_is_cancelled_leaves_the_earlier_result_as_it_was(case: Ca
     before = listing(out)
     assert "work/journal.jsonl" in before and "cloud.laz" in before
     with pytest.raises(ReconstructionError, match="no points") as failed:
-        export(case.out, out, Options.from_flat({"min_confidence": 1.0}))
+        export(case.out, out, Options.from_flat({**LIGHT, "min_confidence": 1.0}))
     assert failed.value.report == out / "failed-report.json"
     assert "no points" in json.loads(failed.value.report.read_text(encoding="utf-8"))["error"]
     for _ in range(2):
         with pytest.raises(Cancelled):
-            reconstruct(case.photos, out, Options.from_flat(FAST), cancel=Later(2))
+            reconstruct(case.photos, out, Options.from_flat({**FAST, **LIGHT}), cancel=Later(2))
     after = listing(out)
     assert {name: after[name] for name in before} == before
     assert all(name.startswith(("failed-report.", "work/attempt-")) for name in set(after) - set(before))
-    export(case.out, out, Options())
+    export(case.out, out, Options.from_flat(LIGHT))
     assert not (out / "failed-report.json").exists()
 
 
@@ -205,17 +206,17 @@ def test_a_map_that_cannot_be_georeferenced_stays_beside_the_earlier_result(case
     before = listing(out)
     name = sorted(case.photos.glob("*.JPG"))[2].name
     (tmp_path / "geo.txt").write_text(f"EPSG:4326\n{name} 15.0 48.0 300\n", encoding="utf-8")
-    few = Options.from_flat({**FAST, "dense_px": 64, "positions": str(tmp_path / "geo.txt")})
+    few = Options.from_flat({**FAST, **LIGHT, "dense_px": 64, "positions": str(tmp_path / "geo.txt")})
     with pytest.raises(GeoreferenceError) as failed:
         reconstruct(case.photos, out, few)
     home = Path(str(failed.value.way_on).split("export ")[1].split(" NEW-FOLDER")[0])
     assert {name: held for name, held in listing(out).items() if name in before} == before
-    assert export(home, tmp_path / "local", Options.from_flat({"local": True})).placed == 12
+    assert export(home, tmp_path / "local", Options.from_flat({**LIGHT, "local": True})).placed == 12
 
 
 def test_results_among_the_photographs_are_no_photographs(case: Case) -> None:
     out = case.photos / "result"
-    export(case.out, out, Options())
+    export(case.out, out, Options.from_flat(LIGHT))
     assert (out / "preview.png").exists()
     shots, refused = read_photographs(case.photos, IntakeOptions(), leave_out=out)
     assert len(shots) + len(refused) == 14  # as without the results
