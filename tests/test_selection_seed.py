@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from onthefly3r.selection import seed as seed_module
-from onthefly3r.selection.seed import choose_first_seed, choose_seed
+from onthefly3r.selection.seed import choose_first_seed, choose_seed, hanging_together
 
 
 class Plane:
@@ -89,3 +89,7 @@ def test_the_papers_seed_takes_one_of_two_copies() -> None:
     places = np.repeat(grid(20, 1), 2, axis=0)
     chosen = choose_first_seed(range(40), Plane(places), 8, frozenset(), lambda a, b: a // 2 == b // 2)
     assert len({i // 2 for i in chosen}) == 8
+
+
+def test_an_empty_seed_stays_empty() -> None:
+    assert hanging_together((), range(5), lambda a, b: np.zeros((len(a), len(b)))) == ()

@@ -119,10 +119,10 @@ def hanging_together(
 
     A blob takes the size that is asked for, even where its images are of several places.
     """
-    affinity = similarities(seed, candidates)
     neighbours = min(CONNECTING_NEIGHBOURS, len(candidates) - 1)
-    if neighbours < 1:
+    if not seed or neighbours < 1:
         return seed
+    affinity = similarities(seed, candidates)
     column = {index: k for k, index in enumerate(candidates)}
     own = np.array([column[index] for index in seed])
     affinity[np.arange(len(seed)), own] = -np.inf
