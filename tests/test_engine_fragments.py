@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +14,13 @@ from onthefly3r.geometry.umeyama import weighted_similarity
 from onthefly3r.map.state import MapState
 from onthefly3r.map.store import Store
 from onthefly3r.options import GeoreferenceOptions
+from onthefly3r.records import LocalModel, Rejection, Subset
 from onthefly3r.run.parts import laid_out, main_reference
 from onthefly3r.simulate import Survey
-from onthefly3r.simulate.oracle import Faults
-from oracle_runs import NO_GPS, Outcome, run, survey_of
+from onthefly3r.simulate.oracle import Faults, covisible_groups, footprint_centre
+from oracle_runs import NO_GPS, Outcome, Recorder, run, survey_of
 
+FOOTPRINT_M = 0.6 * 147.0  # footprints nearer to each other than this see enough of the same ground
 STRAYS = Faults(strays=True)  # what shares no ground with the others of a subset is put anywhere
 
 
@@ -83,3 +86,31 @@ def assert_same_place(one: MapState, other: MapState) -> None:
     assert one.fragments() == other.fragments()
     for index in one.frames:
         np.testing.assert_allclose(one.map_from_cam(index).matrix(), other.map_from_cam(index).matrix(), atol=1e-12)
+
+
+def test_a_seed_that_falls_apart_begins_with_the_part_that_holds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A local reconstructor of several places gives one of them, as structure from motion does."""
+    whole = Recorder.reconstruct
+    sizes = []
+
+    def largest_only(self: Recorder, subset: Subset, images: Any, calibrations: Any) -> LocalModel | Rejection:
+        model = whole(self, subset, images, calibrations)
+        assert isinstance(model, LocalModel)
+        views = self._survey.views
+        places = np.stack([footprint_centre(views[i]) for i in subset.members])
+        held = {subset.members[k] for k in covisible_groups(places, FOOTPRINT_M)[0]}
+        sizes.append((len(subset.references), len(subset.new), len(held)))
+        return replace(model, views={i: view for i, view in model.views.items() if i in held})
+
+    monkeypatch.setattr(Recorder, "reconstruct", largest_only)
+    survey = survey_of(80, 8)
+    order = [i for at_once in zip(range(12), range(40, 52), range(68, 80), strict=True) for i in at_once]
+    rest = [i for i in range(80) if i not in order]
+    outcome = run(tmp_path, replace(survey, views=tuple(survey.views[i] for i in order + rest)), live=True, **NO_GPS)
+    references, new, held = sizes[0]
+    assert (references, new) == (0, 30) and 10 <= held < 15  # fewer than half of it hold together
+    assert sizes[1][0] > 0  # it was not thrown away and another seed tried
+    assert sum(frame.submap == 0 for frame in outcome.engine.state.frames.values()) == held
+    assert outcome.coverage >= 0.98 and worst_of_parts_m(outcome) < 1.5

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from ..geometry.transforms import Sim3
-from ..records import Rejection, Submap, Subset
+from ..records import LocalModel, Rejection, Submap, Subset
 from ..registration.references import scene_spacing
 from ..registration.register import check_seed, seed_edges
 from ..selection.seed import choose_first_seed, choose_seed, hanging_together
@@ -94,8 +94,7 @@ class Seeds:
         refused = check_seed(model.views, bench.threshold) if bench.validates_queries else {}
         good = [i for i in subset.new if i in model.views and i not in refused]
         spacing = scene_spacing({i: model.views[i] for i in good}, bench.threshold)
-        seen = len(subset.new) - len(model.left_out)
-        if len(good) < max(3, MIN_SEED_SHARE * seen) or not spacing > 0.0:
+        if len(good) < self._least(subset, model) or not spacing > 0.0:
             return False
         number = bench.state.next_submap()
         bench.state.set_spacing(spacing, number)
@@ -104,3 +103,14 @@ class Seeds:
         bench.commit(model, Submap(number, Sim3(), (), (), edges, fragment=number), good)
         self._drift.optimise(number)
         return True
+
+    def _least(self, subset: Subset, model: LocalModel) -> float:
+        """Return how many images of a seed must be sound.
+
+        Half of them; but a joint reconstruction may fall apart, and then the part that holds is a seed, if it is one
+        for itself and most of it is sound: the others go to other subsets.
+        """
+        of_all = max(3.0, MIN_SEED_SHARE * (len(subset.new) - len(model.left_out)))
+        if not self._bench.options.registration.fragments:
+            return of_all
+        return min(of_all, max(LEAST_FRAGMENT_SO_FAR, MIN_SEED_SHARE * len(model.views)))
