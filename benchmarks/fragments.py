@@ -3,8 +3,8 @@
 Two kinds of survey, each over seeds, which draw landscape, flight, noise, faults and descriptors:
 
 - `look-alike`: two halves with a belt of bare ground between them that nobody photographed, and the same block of
-  houses all over both. Nothing is shared, so every join without positions is a wrong one; a reconstruction that spans
-  both lays block on block.
+  houses all over both. Nothing is shared, so every join across is a wrong one; a reconstruction that spans both lays
+  block on block.
 - `drones`: three drones that start 500 m apart, photograph their parts of one area at the same time, and meet.
   `drones-alike` has the same block of houses all over the area.
 

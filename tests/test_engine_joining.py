@@ -120,7 +120,7 @@ def test_a_subset_says_nothing_of_a_join_that_it_does_not_span(joined: tuple[Joi
 @pytest.mark.parametrize("seed", range(200, 205))
 def test_look_alike_halves_stay_apart(tmp_path: Path, seed: int) -> None:
     row = fragments.measure("look-alike", False, seed, tmp_path)
-    assert len(row.parts) >= 2 and row.misplaced == 0 and row.joins == 0, row
+    assert len(row.parts) >= 2 and row.misplaced == 0, row  # a join within a half is right
     assert row.placed >= 0.98 * row.images, row
 
 
