@@ -6,7 +6,7 @@ from pathlib import Path
 
 from onthefly3r.geometry.transforms import Sim3
 from onthefly3r.options import ExportOptions, Options
-from onthefly3r.products.catalogue import PRODUCTS
+from onthefly3r.products.catalogue import PRODUCTS, layers_in
 from onthefly3r.products.exportframe import ExportFrame
 from onthefly3r.products.runview import RunView
 from onthefly3r.products.writing import write_products
@@ -50,6 +50,13 @@ def test_everything_written_is_listed(tmp_path: Path) -> None:
     assert written
     assert written <= LISTED
     assert made["cloud"].points > 0
+    layers = layers_in(out, made)
+    assert {layer["path"] for layer in layers} <= written
+    shown = [layer["table"] or layer["path"] for layer in layers if layer["shown"]]
+    assert shown[0] == "cameras"
+    assert shown[-1].startswith("cloud.")
+    assert {layer["table"] for layer in layers} >= {"footprints", "coverage"}
+    assert "control" not in {layer["table"] for layer in layers}
 
 
 def test_what_is_not_wanted_is_not_written(tmp_path: Path) -> None:

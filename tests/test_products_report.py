@@ -110,12 +110,7 @@ def test_strict_json_and_undecodable_names(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["report.json"]
 
 
-def test_the_first_warning_says_when_much_is_missing_or_doubtful() -> None:
-    few = replace(summary(), placed=10)
-    assert build_report(few, None)["warnings"][0].startswith("only 10 of 20 photographs are in the result")
-    assert build_report(replace(summary(), placed=11), None)["warnings"][0] == "one"
-    residuals = dict.fromkeys(range(18), (0.0, 0.0, 0.0))
-    doubtful = replace(summary(), georeference=replace(GEO, n_used=12, n_outliers=6, residuals_m=residuals))
-    assert build_report(doubtful, None)["warnings"][0].startswith("6 of 18 positions disagree with the map")
-    fine = replace(summary(), georeference=replace(GEO, n_used=13, n_outliers=5, residuals_m=residuals))
-    assert build_report(fine, None)["warnings"][0] == "one"
+def test_what_needs_attention_is_the_first_warning() -> None:
+    report = build_report(replace(summary(), attention=("three are missing",)), None)
+    assert report["attention"] == ["three are missing"]
+    assert report["warnings"][:2] == ["three are missing", "one"]

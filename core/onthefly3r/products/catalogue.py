@@ -40,6 +40,7 @@ class Layer:
     title: str
     kind: Literal["vector", "raster", "point cloud"]
     height: int
+    table: str = ""  # in a GeoPackage
     style: str = ""  # file in products/styles
     shown: bool = True  # False: among the layers, but switched off
 
@@ -63,6 +64,27 @@ class Product:
 def product(name: str) -> Product:
     """Return the product of this name; raises `KeyError`."""
     return next(item for item in PRODUCTS if item.name == name)
+
+
+def layers_in(folder: Path, made: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the layers of a folder of products from the top down, as JSON values; tables without rows are left out.
+
+    `made` is what `writing.write_products` returned.
+    """
+    rows = made.get("geopackage") or {}
+    layers = [layer for item in PRODUCTS for layer in item.layers if (folder / layer.file).is_file()]
+    return [
+        {
+            "name": layer.title,
+            "path": layer.file,
+            "table": layer.table or None,
+            "kind": layer.kind,
+            "style": layer.style or None,
+            "shown": layer.shown,
+        }
+        for layer in sorted(layers, key=lambda layer: -layer.height)
+        if not layer.table or rows.get(layer.table)
+    ]
 
 
 def _always(export: ExportOptions) -> bool:
@@ -129,8 +151,8 @@ def _footprints(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
     write_footprints(out / "footprints.shp", view.footprints, view.crs)
 
 
-def _geopackage(out: Path, view: RunView, made: Mapping[str, Any]) -> None:
-    write_geopackage(
+def _geopackage(out: Path, view: RunView, made: Mapping[str, Any]) -> dict[str, int]:
+    return write_geopackage(
         out / "survey.gpkg",
         view.rows,
         view.footprints,
@@ -191,23 +213,23 @@ PRODUCTS: tuple[Product, ...] = (
             Layer("gsd.tif", "Ground sampling distance", "raster", 7, shown=False),
         ),
     ),
+    Product("cameras", "Cameras", _shapefile("cameras"), _always, _cameras),
+    Product("footprints", "Footprints", _shapefile("footprints"), _always, _footprints),
     Product(
-        "cameras",
-        "Cameras",
-        _shapefile("cameras"),
+        "geopackage",
+        "Cameras, rejected photographs, control, footprints and coverage",
+        ("survey.gpkg",),
         _always,
-        _cameras,
-        layers=(Layer("cameras.shp", "Cameras", "vector", 80, "cameras.qml"),),
+        _geopackage,
+        layers=(
+            Layer("survey.gpkg", "Rejected photographs", "vector", 90, "rejected", "rejected.qml"),
+            Layer("survey.gpkg", "Cameras", "vector", 80, "cameras", "cameras.qml"),
+            Layer("survey.gpkg", "Ground control", "vector", 70, "control"),
+            Layer("survey.gpkg", "Footprints", "vector", 60, "footprints", "footprints.qml", shown=False),
+            Layer("survey.gpkg", "Fly here again", "vector", 55, "fly_again", shown=False),
+            Layer("survey.gpkg", "Covered ground", "vector", 50, "coverage", shown=False),
+        ),
     ),
-    Product(
-        "footprints",
-        "Footprints",
-        _shapefile("footprints"),
-        _always,
-        _footprints,
-        layers=(Layer("footprints.shp", "Footprints", "vector", 60, "footprints.qml", shown=False),),
-    ),
-    Product("geopackage", "Cameras, rejected photographs, footprints", ("survey.gpkg",), _always, _geopackage),
     Product("trajectory", "Camera poses as a table", ("trajectory.csv",), _always, _trajectory),
     Product(
         "colmap",

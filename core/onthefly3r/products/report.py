@@ -52,29 +52,14 @@ class RunSummary:
     cloud: CloudSummary | None = None
     products: Mapping[str, Any] = field(default_factory=dict)  # what `writing.write_products` returned
     figures: Sequence[Figure] = ()  # of the page
+    layers: Sequence[Mapping[str, Any]] = ()  # as `catalogue.layers_in` returns them
     error: str | None = None  # why the run ended early
+    attention: Sequence[str] = ()  # what must be known before anything else, see `run.verdict`
     warnings: Sequence[str] = ()
     details: Mapping[str, Any] = field(default_factory=dict)  # further figures, JSON values
     backbone_facts: Mapping[str, Any] = field(default_factory=dict)  # name, version, licence, weights
     unit: str = "m"  # of the cloud's coordinates: a local frame without scale has map units
     stage_memory: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # peaks by stage, MiB
-
-
-def attention(placed: int, given: int, georeference: GeoReference | None) -> list[str]:
-    """Return what must be known before anything else: that much of the input is not in the result, or is doubted."""
-    told = []
-    if 2 * placed <= given and placed:
-        told.append(
-            f"only {placed} of {given} photographs are in the result: the rest did not fit together, or overlaps too "
-            "little; the report lists why"
-        )
-    positions = len(georeference.residuals_m) or georeference.n_used if georeference else 0
-    if georeference and 3 * georeference.n_outliers >= positions > 0:
-        told.append(
-            f"{georeference.n_outliers} of {positions} positions disagree with the map: where it lies on the Earth is "
-            "doubtful; check the positions in the tags or in the position file"
-        )
-    return told
 
 
 def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
@@ -120,6 +105,7 @@ def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
             "unit": run.unit,
         },
         **facts_of(run.products),
+        "layers": [dict(layer) for layer in run.layers],
         "timing": {
             "total_s": timing.total_s,
             "per_image_s": timing.total_s / run.given if run.given else None,
@@ -129,8 +115,8 @@ def build_report(run: RunSummary, peak_rss_mib: float | None) -> dict[str, Any]:
         },
         "memory": {"peak_rss_mib": peak_rss_mib, "stages": dict(run.stage_memory)},
         "error": run.error,
-        "attention": attention(run.placed, run.given, geo),
-        "warnings": [*attention(run.placed, run.given, geo), *run.warnings, *(geo.warnings if geo else ())],
+        "attention": list(run.attention),
+        "warnings": [*run.attention, *run.warnings, *(geo.warnings if geo else ())],
         "details": dict(run.details),
     }
     return dict(_plain(report))

@@ -15,6 +15,7 @@ from ..files.las_index import indexes_beside, indexes_of
 from ..map.state import MapState
 from ..map.store import Store
 from ..options import Options
+from ..products.catalogue import layers_in
 from ..products.exportframe import ExportFrame
 from ..products.las import CloudSummary
 from ..products.page import write_page
@@ -28,7 +29,7 @@ from ..stopwatch import Stopwatch, peak_rss_mib
 from .parts import laid_out, main_part, main_reference
 from .record import RunRecord
 from .run_folder import FAILED_REPORTS, FAILURE, REPORTS, RESULT, RunFolder
-from .verdict import misfits, raise_for, shortfall
+from .verdict import doubtful_positions, misfits, raise_for, shortfall
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,7 @@ def _export(
             checkpoint=checkpoint,
         )
         products = write_products(made, view)
-        drawn = figures(view, made)
+        drawn, layers = figures(view, made), layers_in(made, products)
     if products.get("far_points"):
         warnings.append(f"{products['far_points']:,} points far outside the survey are left out of all products")
     unread = products["orthophoto"].missing if products.get("orthophoto") else ()
@@ -192,11 +193,18 @@ def _export(
     cloud = products.get("cloud")
     given = len(record.shots) + len(record.refused)
     misfit, is_far = misfits(record.details, record.shots, reference)
-    told = [*shortfall(len(state.frames), given), *misfit, *apart, *warnings, *view.dense.warnings()]
+    attention = [*shortfall(len(state.frames), given), *doubtful_positions(reference)]
+    told = [*misfit, *apart, *warnings, *view.dense.warnings()]
     summary = _summary(mapped, options, stopwatch, reference, cloud, told, None)
     details = {**summary.details, "dense_cloud": view.dense.told()} if cloud else summary.details
     unit = "m" if view.frame.metric else "map units"
-    return replace(summary, unit=unit, details=details, products=products, figures=drawn), misfit, is_far
+    return (
+        replace(
+            summary, unit=unit, details=details, products=products, figures=drawn, layers=layers, attention=attention
+        ),
+        misfit,
+        is_far,
+    )
 
 
 @contextlib.contextmanager

@@ -26,6 +26,17 @@ def shortfall(placed: int, given: int) -> list[str]:
     ]
 
 
+def doubtful_positions(reference: GeoReference | None) -> list[str]:
+    """Return what to say where so many positions disagree with the map that its place on the Earth is in doubt."""
+    positions = len(reference.residuals_m) or reference.n_used if reference else 0
+    if reference is None or not 3 * reference.n_outliers >= positions > 0:
+        return []
+    return [
+        f"{reference.n_outliers} of {positions} positions disagree with the map: where it lies on the Earth is "
+        "doubtful; check the positions in the tags or in the position file"
+    ]
+
+
 def misfits(
     details: Mapping[str, Any], shots: Mapping[int, Shot], reference: GeoReference | None
 ) -> tuple[list[str], bool]:
