@@ -171,9 +171,9 @@ def test_time_follows_from_features_and_sizes(survey: Path, monkeypatch: pytest.
     clock = itertools.count(step=3)  # three seconds for the three photographs that are timed
     monkeypatch.setattr(estimate.time, "perf_counter", lambda: float(next(clock)))
     standard = check_photographs(survey, Options.from_flat({"threads": 1}))
-    assert standard.time_s == pytest.approx(12 * (1.0 + 2.5 + 10.0 * 0.25))
+    assert standard.time_s == pytest.approx(12 * (1.0 + 6.0 + 25.0 * 0.25))
     two_cores = check_photographs(survey, Options.from_flat({"threads": 2, "dense_px": 250}))
-    assert two_cores.time_s == pytest.approx(12 * (1.0 + 2.5 + 10.0 * 0.0625) / 2)
+    assert two_cores.time_s == pytest.approx(12 * (1.0 + 6.0 + 25.0 * 0.0625) / 2)
     assert check_photographs(survey, Options.from_flat({"backbone": "pi3"})).time_s is None
 
 

@@ -50,7 +50,9 @@ class FakeEngine:
     trouble: Callable[[], None] = lambda: None
     options: Options | None = None
 
-    def reconstruct(self, photos: Path, out: Path, options: Options, progress: Any, cancel: Any) -> FakeResult:
+    def reconstruct(
+        self, photos: Path, out: Path, options: Options, progress: Any, cancel: Any, anew: bool = False
+    ) -> FakeResult:
         self.options = options
         progress(Progress("mapping", 4, 10, placed=4, rejected=1, waiting=5, eta_s=75.0))
         self.trouble()
@@ -59,7 +61,7 @@ class FakeEngine:
         progress(Progress("export", 10, 10, placed=9, rejected=1))
         return FakeResult(REPORT, out / "cloud.laz", out / "cameras.shp", out / "report.json", 9, 10)
 
-    def export(self, run: Path, out: Path, options: Options, progress: Any) -> FakeResult:
+    def export(self, run: Path, out: Path, options: Options, progress: Any, partial: bool = False) -> FakeResult:
         return self.reconstruct(run, out, options, progress, lambda: False)
 
 
@@ -238,7 +240,7 @@ def test_unexpected_error_leaves_a_traceback_in_work_only_where_that_is_ours(
 SLOW_ENGINE = """
 import sys, time, types
 engine = types.ModuleType("onthefly3r.run.session")
-def reconstruct(photos, out, options, progress, cancel):
+def reconstruct(photos, out, options, progress, cancel, anew=False):
     from onthefly3r.errors import Cancelled
     from onthefly3r.protocol import Progress
     import os, zlib

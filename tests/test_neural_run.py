@@ -25,6 +25,7 @@ from onthefly3r.evaluate.comparison import evaluate  # noqa: E402
 from onthefly3r.simulate import SurveyOptions, simulate_survey  # noqa: E402
 
 IMAGES = 14
+LIGHT = ("--quality", "preview", "--no-rasters", "--orthophoto", "none")  # files that tests do not look at
 SURVEY = {"images": IMAGES, "strips": 2, "image_width_px": 400, "image_height_px": 300}
 
 
@@ -56,7 +57,7 @@ def call(*arguments: object) -> Any:
 
 def run(survey_folder: Path, out: Path, *more: object) -> dict[str, Any]:
     sizes = ("--seed-size", 5, "--batch-size", 3, "--references", 4, "--subset-references", 5, "--threads", 1)
-    shown = call("run", survey_folder / "photos", out, "--backbone", "truth", "--device", "cpu", *sizes, *more)
+    shown = call("run", survey_folder / "photos", out, "--backbone", "truth", "--device", "cpu", *sizes, *LIGHT, *more)
     assert shown.exit_code == 0, shown.output
     return dict(json.loads((out / "report.json").read_text(encoding="utf-8")))
 
@@ -113,7 +114,7 @@ def test_memory_is_told_by_stage(survey_folder: Path, weights: Path, tmp_path: P
     folders = [tmp_path / "site", Path(__file__).parent, Path(__file__).parents[1] / "core"]
     run_it = ["run", survey_folder / "photos", tmp_path / "out", "--backbone", "truth", "--weights", weights]
     done = subprocess.run(
-        [sys.executable, "-c", program, *run_it, "--device", "cpu", "--seed-size", "5"],
+        [sys.executable, "-c", program, *run_it, *LIGHT, "--device", "cpu", "--seed-size", "5"],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))},
         capture_output=True,
         text=True,
