@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import InputError
+from .files.strict_json import loads
 
 MAX_JOB_BYTES = 1024 * 1024
 
@@ -46,7 +47,7 @@ class Event:
     @classmethod
     def from_line(cls, line: str) -> Event:
         """Parse one line; raises `ValueError` when it is not one of ours."""
-        data = json.loads(line)
+        data = loads(line)
         if not isinstance(data, dict) or not isinstance(data.get("kind"), str):
             raise ValueError(f"not an event: {line[:80]!r}")
         kind, time_s = data.pop("kind"), float(data.pop("time_s", 0.0))
@@ -95,7 +96,7 @@ class Job:
         try:
             if path.stat().st_size > MAX_JOB_BYTES:
                 raise ValueError(f"larger than {MAX_JOB_BYTES} bytes")
-            data = json.loads(path.read_text(encoding="utf-8"))
+            data = loads(path.read_text(encoding="utf-8"))
             verb, arguments, options = data["verb"], tuple(map(str, data["arguments"])), dict(data["options"])
             if not isinstance(verb, str) or not verb.isidentifier():
                 raise ValueError(f"{verb!r} is no verb")

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from .result_readers import RESULT_READERS
+
 
 @dataclass(frozen=True)
 class Reader:
@@ -182,5 +184,6 @@ READERS = [
     Reader("XMP packets", ".xmp", packets, read_xmp),
     Reader("position files", ".txt", position_files, read_position_file),
 ]
+READERS += [Reader(*parts) for parts in RESULT_READERS]
 if find_spec("pillow_heif") is not None:
     READERS.append(Reader("HEIC photographs", ".heic", heics, read_photograph))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
 import re
 import subprocess
@@ -22,6 +21,7 @@ from ..errors import Cancelled, InputError, OptionError, ReconstructionError
 from ..files.atomic import write_text
 from ..files.owned import OwnedFolder
 from ..files.ownership import WORK
+from ..files.strict_json import loads
 from ..intake.folder import find_photographs
 from ..options import Options, over_earlier
 from ..protocol import Event, Job, Progress, ProgressCallback
@@ -313,7 +313,7 @@ def _result(flight: Flight, folder: Path, status: Status, message: str) -> Fligh
 
 def _report(folder: Path) -> dict[str, Any] | None:
     try:
-        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        report = loads((folder / "report.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     return report if isinstance(report, dict) else None

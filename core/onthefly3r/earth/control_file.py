@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 from ..errors import ReferenceFormatError
+from ..files.strict_json import loads
 from ..options import GeoreferenceOptions
 from .control import Collected, Control, Mark, crs_of, number_of
 from .control_table import COLUMNS, from_csv, table_row
@@ -83,7 +83,7 @@ def _from_gcp_list(text: str, path: Path) -> Collected:
 def _from_geojson(text: str, path: Path) -> Collected:
     """Read a FeatureCollection of points; longitude, latitude unless a `crs` member says otherwise."""
     try:
-        told = json.loads(text)
+        told = loads(text)
         features = told["features"]
         named = told.get("crs", {}).get("properties", {}).get("name", "EPSG:4326")
         named = re.sub(r"urn:ogc:def:crs:EPSG:[^:]*:", "EPSG:", str(named))

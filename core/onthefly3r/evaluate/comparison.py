@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from ..errors import InputError
+from ..files.strict_json import loads
 from ..geometry.transforms import Sim3
 from .clouds import open_cloud
 from .readers import read_poses, scene_depth
@@ -182,7 +182,7 @@ def _images_given(result: Path) -> int | None:
     if not report.is_file():
         return None
     try:
-        given = json.loads(report.read_text(encoding="utf-8"))["images"]["given"]
+        given = loads(report.read_text(encoding="utf-8"))["images"]["given"]
     except (ValueError, KeyError, TypeError):
         return None  # not a report of ours: the figure is only extra
     return given if isinstance(given, int) else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import struct
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from ..errors import InputError, ReferenceFormatError
 from ..files.array_file import ArrayFile
+from ..files.strict_json import loads
 from ..geometry.arrays import Float
 from ..geometry.transforms import Rigid3
 from .poses import PoseSet, natural_key
@@ -55,9 +55,9 @@ def read_nerfstudio(path: Path) -> PoseSet:
     try:
         if path.stat().st_size > MAX_JSON_BYTES:
             raise ValueError(f"larger than {MAX_JSON_BYTES // 2**20} MiB")
-        frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
+        frames = loads(path.read_text(encoding="utf-8"))["frames"]
         named = [(str(frame["file_path"]), np.array(frame["transform_matrix"], float)) for frame in frames]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise ReferenceFormatError(
             f"{path}: is no transforms.json with frames, file_path and transform_matrix ({error!r})"
         ) from None

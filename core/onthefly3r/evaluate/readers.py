@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -14,6 +13,7 @@ from typing import TextIO
 import numpy as np
 
 from ..errors import ReferenceFormatError
+from ..files.strict_json import loads
 from ..geometry.arrays import Float
 from ..geometry.frames import world_from_cam_rotation
 from ..geometry.transforms import Rigid3
@@ -160,7 +160,7 @@ def scene_depth(path: Path) -> float | None:
     if not summary.is_file():
         return None
     try:
-        content = json.loads(summary.read_text(encoding="utf-8"))
+        content = loads(summary.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ReferenceFormatError(f"{summary}: not JSON ({error})") from None
     depth = content.get("median_scene_depth") if isinstance(content, dict) else None

@@ -6,12 +6,13 @@ Standard library only: QGIS imports this module in its own process.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+
+from .strict_json import loads
 
 HEADER_BYTES = 375  # of LAS 1.4
 LEGACY_HEADER_BYTES = 227
@@ -91,7 +92,7 @@ def _ept_extent(path: Path) -> Extent | None:
     try:
         if path.stat().st_size > MAX_EPT_BYTES:
             return None
-        told = json.loads(path.read_text(encoding="utf-8"))
+        told = loads(path.read_text(encoding="utf-8"))
         bounds = tuple(float(value) for value in told["boundsConforming"])
         return Extent(int(told["points"]), bounds) if len(bounds) == 6 else None
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import BusyError, InputError
+from .strict_json import loads
 
 LOCK_NAME = "onthefly3r.lock"
 MAX_LOCK_BYTES = 4096
@@ -106,7 +107,7 @@ def _holder(descriptor: int) -> dict[str, Any] | None:
         text = os.read(descriptor, MAX_LOCK_BYTES)
         if not text:
             return {}
-        told = json.loads(text)
+        told = loads(text)
     except (OSError, ValueError):
         return None
     return told if isinstance(told, dict) and isinstance(told.get("pid"), int) and "host" in told else None

@@ -15,6 +15,7 @@ from typing import Any
 from .. import __version__
 from ..errors import InputError
 from .atomic import write_text
+from .strict_json import loads
 
 STAMP_NAME = "onthefly3r.json"
 WORK = "work"
@@ -84,7 +85,7 @@ def read_stamp(folder: Path) -> Stamp | None:
     try:
         if path.is_symlink() or not path.is_file() or path.stat().st_size > MAX_STAMP_BYTES:
             raise ValueError("not a file that this program writes")
-        told = json.loads(path.read_text(encoding="utf-8"))
+        told = loads(path.read_text(encoding="utf-8"))
         if int(told["format"]) > FORMAT:
             raise InputError(f"{path}: was written by a later release ({told.get('software')}); use that one")
         return _stamp_from_json(told)

@@ -22,6 +22,7 @@ import numpy as np
 from .. import __version__
 from ..errors import InputError
 from ..files.array_file import ArrayFile
+from ..files.strict_json import loads
 from ..geometry.arrays import Float, UInt8
 from ..records import CompactReference, NewFrame, Observations, Submap
 from .journal import submap_to_json
@@ -233,5 +234,5 @@ def _parsed(line: bytes, checked: bool) -> tuple[str, Any]:
         sum_told, _, text = text.partition(b" ")
         if sum_told != b"%08x" % zlib.crc32(text):
             raise ValueError("its checksum does not fit")
-    ((kind, value),) = json.loads(text).items()
+    ((kind, value),) = loads(text).items()
     return kind, value

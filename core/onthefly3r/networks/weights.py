@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-import json
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MissingDependencyError, OptionError
+from ..files.strict_json import loads
 
 FILE_NAMES = ("model.safetensors", "model.pt", "model.pth")
 SUFFIXES = (".safetensors", ".pt", ".pth", ".bin", ".ckpt")
@@ -179,7 +179,7 @@ def _config(path: Path) -> dict[str, Any]:
     if not path.is_file() or path.stat().st_size > MAX_CONFIG_BYTES:
         return {}
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise OptionError(f"{path}: not JSON ({error}); download it again") from error
     return content if isinstance(content, dict) else {}

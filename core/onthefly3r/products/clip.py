@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError
+from ..files.strict_json import loads
 from ..geometry.arrays import Bool, Float
 from ..geometry.geodesy import projected_from_geographic
 from ..records import CloudTile, Shot
@@ -79,14 +79,23 @@ def read_polygons(path: Path) -> list[Polygon]:
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise ValueError(f"it is larger than {MAX_FILE_BYTES // 2**20} MiB")
-        told = json.loads(path.read_text(encoding="utf-8-sig"))
+        told = loads(path.read_text(encoding="utf-8-sig"))
         _require_wgs84(told)
         rings_of = [[np.array([point[:2] for point in ring], float) for ring in polygon] for polygon in _polygons(told)]
         rings_of = [rings for rings in rings_of if rings and all(r.ndim == 2 and len(r) >= 4 for r in rings)]
         if not all(np.isfinite(ring).all() for rings in rings_of for ring in rings):
             raise ValueError("it holds a coordinate that is not finite")
         polygons = [shapely.Polygon(rings[0], rings[1:]) for rings in rings_of]
-    except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError, shapely.errors.ShapelyError) as error:
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        IndexError,
+        OverflowError,
+        RecursionError,
+        shapely.errors.ShapelyError,
+    ) as error:
         raise InputError(f"boundary {path} is no GeoJSON of polygons ({error}); save it as GeoJSON") from error
     if not polygons:
         raise InputError(f"boundary {path} holds no polygon; draw the area as a polygon and save it as GeoJSON")

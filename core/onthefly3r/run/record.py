@@ -11,6 +11,7 @@ from typing import Any, Literal
 from .. import __version__
 from ..errors import InputError
 from ..files.atomic import write_text
+from ..files.strict_json import loads
 from ..map.journal import shot_from_json, shot_to_json
 from ..options import slice_classes
 from ..records import RefusedPhotograph, Rejection, Shot
@@ -111,7 +112,7 @@ def _load(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise ValueError(f"larger than {MAX_BYTES} bytes")
-        stored = json.loads(path.read_text(encoding="utf-8"))
+        stored = loads(path.read_text(encoding="utf-8"))
         if not isinstance(stored, dict):
             raise ValueError("no JSON object")
         if int(stored.get("format", 1)) > FORMAT:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import re
 import secrets
@@ -14,6 +13,7 @@ from ..errors import InputError
 from ..files.owned import OwnedFolder, relative_files, require_free
 from ..files.ownership import CRASH_NOTE, MAP, WORK, Listed, Stamp, fingerprint, read_stamp
 from ..files.room import storage_errors
+from ..files.strict_json import loads
 from ..products.catalogue import PRODUCTS
 
 RESULT, FAILURE = "result", "failure"  # groups of files, each replaced as a whole, beside that of the map
@@ -165,7 +165,7 @@ def _report_of_ours(path: Path) -> bool:
     try:
         if path.stat().st_size > MAX_REPORT_BYTES:
             return False
-        report = json.loads(path.read_text(encoding="utf-8"))
+        report = loads(path.read_text(encoding="utf-8"))
         return "backbone" in report["software"] and "placed" in report["images"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False
