@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 
-def loads(text: str) -> Any:
+def loads(text: str | bytes) -> Any:
     """Parse JSON; raises `ValueError` for damaged text, and for nesting that no file of ours has."""
     try:
         return json.loads(text)
