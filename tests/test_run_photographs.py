@@ -22,7 +22,7 @@ pytestmark = pytest.mark.photographs
 # photographs tell the principal point, the reference has it free too: held in the middle it is 2.2 % off on caliterra.
 COVERAGE, ATE_PERCENT, ARE_DEG = 0.95, 0.7, 0.5
 WITH_FREE_POINT = {"caliterra": 0.10}  # set -> largest error in %
-CAMERAS_ONLY = {"dense_px": 100, "cloud": False}
+CAMERAS_ONLY = {"dense_px": 100, "cloud": False, "rasters": False, "orthophoto": "none"}
 
 
 def run(sets: Path, name: str, out: Path, **options: Any) -> EvaluationReport:
@@ -83,7 +83,7 @@ def test_copr_has_no_positions(photograph_sets: Path, tmp_path: Path) -> None:
     """The report says so; asked for, the files are written in units of the map."""
     with pytest.raises(GeoreferenceError, match="--local"):
         reconstruct(photograph_sets / "copr" / "photos", tmp_path / "run", Options.from_flat({"dense_px": 200}))
-    local = export(tmp_path / "run", tmp_path / "local", Options.from_flat({"local": True}))
+    local = export(tmp_path / "run", tmp_path / "local", Options.from_flat({"local": True, "quality": "preview", "orthophoto": "none"}))
     assert local.cloud is not None and local.report["cloud"]["points"] > 10_000
     reference = read_poses(photograph_sets / "copr" / "reference")
     assert len(set(reference.names) & set(read_poses(tmp_path / "local").names)) >= COVERAGE * len(reference.names)
