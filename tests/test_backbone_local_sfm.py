@@ -72,7 +72,7 @@ def test_weakly_tied_images_are_placed_by_a_second_try(most: int, monkeypatch: p
     assert model is not None
     assert len(model.local_from_cam) >= 11
     assert worst_centre(model, truth) < 0.01
-    monkeypatch.setattr(module, "_attempts", lambda *given: iter([module._pipeline_options(1)]))
+    monkeypatch.setattr(module, "_attempts", lambda *given: iter([module._pipeline_options()]))
     once = rebuilt(truth, matches)
     assert once is None or len(once.local_from_cam) < len(model.local_from_cam)
 
@@ -81,7 +81,7 @@ def test_a_model_that_holds_all_is_made_once(monkeypatch: pytest.MonkeyPatch) ->
     truth = block(noise_px=0.4)
     made = []
     once = module._pipeline_options
-    monkeypatch.setattr(module, "_pipeline_options", lambda threads: made.append(threads) or once(threads))
+    monkeypatch.setattr(module, "_pipeline_options", lambda: made.append(1) or once())
     model = rebuilt(truth, matches_of(truth))
     assert model is not None and len(model.local_from_cam) == 12 and len(made) == 1
 

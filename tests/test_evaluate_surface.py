@@ -198,7 +198,7 @@ def test_a_truncated_laz_is_told(tmp_path: Path) -> None:
 
 
 def test_folder_without_cloud(tmp_path: Path) -> None:
-    with pytest.raises(ReferenceFormatError, match="neither"):
+    with pytest.raises(ReferenceFormatError, match="holds no cloud"):
         open_cloud(tmp_path)
 
 

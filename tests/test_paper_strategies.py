@@ -237,7 +237,7 @@ def test_the_graph_is_cut_where_it_is_weakest() -> None:
 
 def test_a_visual_order_follows_the_line_and_interleaved_parts_span_it() -> None:
     shuffled = np.random.default_rng(0).permutation(90)
-    order = hamiltonian_order(90, on_a_line([0.01 * place for place in shuffled]))
+    order = hamiltonian_order(90, on_a_line([0.03 * place for place in shuffled]))
     places = shuffled[order].tolist()
     assert places in (list(range(90)), list(range(89, -1, -1)))
     windows = interleaved_windows(list(range(90)), 30)

@@ -98,10 +98,10 @@ def test_solver_that_fails_leaves_the_map_and_a_warning(
         raise error
 
     for name in ("optimise_submaps", "adjust_block"):
-        monkeypatch.setattr(f"onthefly3r.engine.loop.{name}", fail)
+        monkeypatch.setattr(f"onthefly3r.engine.drift.{name}", fail)
     engine = run(tmp_path, survey_of(24, 2)).engine
     assert len(engine.state.frames) > 12
-    engine._refine()
+    engine.drift.refine()
     told = " ".join(engine.warnings)
     assert "the refinement failed" in told
     assert str(error) in told

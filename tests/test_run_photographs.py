@@ -83,7 +83,11 @@ def test_copr_has_no_positions(photograph_sets: Path, tmp_path: Path) -> None:
     """The report says so; asked for, the files are written in units of the map."""
     with pytest.raises(GeoreferenceError, match="--local"):
         reconstruct(photograph_sets / "copr" / "photos", tmp_path / "run", Options.from_flat({"dense_px": 200}))
-    local = export(tmp_path / "run", tmp_path / "local", Options.from_flat({"local": True, "quality": "preview", "orthophoto": "none"}))
+    local = export(
+        tmp_path / "run",
+        tmp_path / "local",
+        Options.from_flat({"local": True, "quality": "preview", "orthophoto": "none"}),
+    )
     assert local.cloud is not None and local.report["cloud"]["points"] > 10_000
     reference = read_poses(photograph_sets / "copr" / "reference")
     assert len(set(reference.names) & set(read_poses(tmp_path / "local").names)) >= COVERAGE * len(reference.names)

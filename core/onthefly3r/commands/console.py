@@ -164,7 +164,8 @@ class Session:
         """Let Ctrl-C and termination signals ask this session to stop; does nothing outside the main thread."""
         if threading.current_thread() is threading.main_thread():
             for number in STOP_SIGNALS:
-                if signal.getsignal(number) is not signal.SIG_IGN:  # as `nohup` wants it
+                hang_up = number == getattr(signal, "SIGHUP", None)
+                if not (hang_up and signal.getsignal(number) is signal.SIG_IGN):  # as `nohup` wants it
                     signal.signal(number, self._stop)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:

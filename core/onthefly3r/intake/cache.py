@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import tempfile
 import threading
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -58,16 +60,22 @@ class ImageCache(Mapping[int, WorkingImage]):
     def _remember(self, index: int, image: WorkingImage) -> None:
         with self._lock:
             self._recent[index] = image
-            over = len(self._recent) - CACHED_IMAGES
-            leaving = [self._recent.popitem(last=False) for _ in range(max(0, over))]
-        for number, old in leaving:
+            over = max(0, len(self._recent) - CACHED_IMAGES)
+            leaving = list(islice(self._recent.items(), over))
+        for number, old in leaving:  # each is at hand until it is on the disk, so that nobody decodes it again
             if self._folder is not None and number not in self._stored:
                 self._write(number, old, self._folder)
+        with self._lock:
+            for number, _ in leaving:
+                self._recent.pop(number, None)
 
     def _write(self, index: int, image: WorkingImage, folder: Path) -> None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            _path(folder, index).write_bytes(image.rgb.tobytes())
+            path = _path(folder, index)
+            with tempfile.NamedTemporaryFile(dir=folder, prefix=path.stem, delete=False) as part:
+                part.write(image.rgb.tobytes())
+            Path(part.name).replace(path)  # whole at once: another thread may be reading it
         except OSError:  # no room: the photograph is decoded again when it is asked for
             return
         with self._lock:
