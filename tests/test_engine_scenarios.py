@@ -59,8 +59,11 @@ def test_a_hundred_and_sixty_domed_local_models(tmp_path: Path) -> None:
 
 
 def test_only_the_papers_graph_leaves_the_cloud_behind_its_cameras(tmp_path: Path) -> None:
-    outcome = run(tmp_path, survey_of(60, 4), preset="paper")
-    assert gap_between_cloud_and_cameras_px(outcome) > 0.5
+    """Its cameras move by as much as there is drift to remove, and the cloud stays; ours move together."""
+    paper = run(tmp_path / "paper", survey_of(60, 4), preset="paper")
+    ours = run(tmp_path / "ours", survey_of(60, 4))
+    assert gap_between_cloud_and_cameras_px(paper) > 0.2
+    assert gap_between_cloud_and_cameras_px(ours) < 0.01
 
 
 @pytest.mark.slow
