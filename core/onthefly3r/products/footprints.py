@@ -12,7 +12,7 @@ from ..files.atomic import replacing
 from ..geometry.arrays import Float
 from ..records import PlacedCamera
 from .clip import in_ring
-from .vector import esri_wkt, fit_text
+from .vector import fit_text, write_companions
 
 # Oblique views see to the horizon: a footprint ends where the ground is this many flying heights away.
 MAX_REACH = 4.0
@@ -92,11 +92,7 @@ def write_footprints(path: Path, footprints: Iterable[Footprint], crs: str | Non
                 name = fit_text(item.image, 254, keep_end=True)
                 writer.record(name, item.number, item.gsd_m, item.area_m2, item.overlap)
                 count += 1
-        temporary.with_suffix(".cpg").write_text("UTF-8", encoding="ascii")
-        if crs is None:
-            path.with_suffix(".prj").unlink(missing_ok=True)
-        else:
-            temporary.with_suffix(".prj").write_text(esri_wkt(crs), encoding="utf-8")
+        write_companions(temporary, path, crs)
     return count
 
 

@@ -71,12 +71,17 @@ def write_cameras(path: Path, rows: Iterable[CameraRow], crs: str | None) -> int
                 writer.pointz(*position)
                 writer.record(*_record(row))
                 count += 1
-        temporary.with_suffix(".cpg").write_text("UTF-8", encoding="ascii")
-        if crs is None:
-            path.with_suffix(".prj").unlink(missing_ok=True)
-        else:
-            temporary.with_suffix(".prj").write_text(esri_wkt(crs), encoding="utf-8")
+        write_companions(temporary, path, crs)
     return count
+
+
+def write_companions(temporary: Path, path: Path, crs: str | None) -> None:
+    """Write the encoding and the CRS beside a shapefile that becomes `path`; without a CRS an earlier one goes."""
+    temporary.with_suffix(".cpg").write_text("UTF-8", encoding="ascii")
+    if crs is None:
+        path.with_suffix(".prj").unlink(missing_ok=True)
+    else:
+        temporary.with_suffix(".prj").write_text(esri_wkt(crs), encoding="utf-8")
 
 
 def esri_wkt(crs: str) -> str:
